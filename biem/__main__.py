@@ -1,0 +1,167 @@
+"""Command line: python -m biem run | plan | plot | verify. Exit codes: 0 done, 2 bad input, 3 step rejected, 4 stopped, 5 file error."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from tqdm import tqdm
+
+from biem.backend import fft_backend
+from biem.curves.curve import area, length
+from biem.errors import NumericalFailure
+from biem.run.simulate import Stopped, make_stepper, simulate
+from biem.run.trajectory import Trajectory, read_trajectory
+from biem.scene.build import Problem, build
+from biem.scene.config import Scene, load_scene
+from biem.scene.plan import memory_estimate, required_parts, trajectory_bytes
+from biem.steppers.stepper import State
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
+
+ScenePath = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE", show_default=False)]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="Override a key: --set vesicles.points=32.", metavar="KEY=VALUE")]
+SolverName = Annotated[str | None, typer.Option("--solver", help="Override solver.kind.")]
+TrajectoryPath = Annotated[Path, typer.Argument(help="Trajectory (HDF5).", metavar="TRAJECTORY", show_default=False)]
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Errors that are the input's or the disk's end in one line and an exit code, not in a traceback."""
+    try:
+        yield
+    except NumericalFailure as error:
+        _fail(str(error), 3)
+    except Stopped as stopped:
+        _fail(f"{stopped}; go on with --resume", 4)
+    except FileNotFoundError as error:
+        _fail(str(error), 2)
+    except OSError as error:
+        _fail(f"file error: {error}", 5)
+    except (ValueError, MemoryError) as error:
+        _fail(str(error), 2)
+
+
+def _fail(message: str, code: int) -> None:
+    typer.echo(f"error: {message}", err=True)
+    raise typer.Exit(code)
+
+
+@app.command()
+def run(
+    scene: ScenePath,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Trajectory to write; default out/NAME.h5.")] = None,
+    solver: SolverName = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the output.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an output that exists.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """Run a scene to its horizon."""
+    with one_line_errors():
+        loaded = _load(scene, solver, overrides)
+        path = output or Path(loaded.output.trajectory or f"out/{loaded.name}.h5")
+        for notice in build(loaded).notices if loaded.vesicles.file else ():
+            typer.echo(f"notice: {notice}", err=True)
+        done = simulate(loaded, path, resume=resume, force=force, progress=not quiet)
+        if not quiet:
+            typer.echo(_summary(done.trajectory, path, done.counts))
+
+
+@app.command()
+def plan(
+    scene: ScenePath,
+    solver: SolverName = None,
+    measure: Annotated[bool, typer.Option(help="Time two steps for the estimate.")] = True,
+    overrides: Overrides = None,
+) -> None:
+    """Print what a scene requires, and why, with memory, file size and time."""
+    with one_line_errors():
+        problem = build(_load(scene, solver, overrides))
+        M, _, N = problem.X.shape
+        typer.echo(f"{problem.scene.name}: {M} vesicle(s) of {N} nodes, {problem.steps} steps of dt = {problem.dt:.6g}{_in_flow_times(problem)}")
+        parts = required_parts(problem)
+        wide = max(len(p.name) for p in parts)
+        for part in parts:
+            typer.echo(f"  {'yes' if part.needed else ' - '}  {part.name:<{wide}}  {part.why}")
+        typer.echo(f"memory of a step: {memory_estimate(problem) / 1e6:.0f} MB; trajectory: {trajectory_bytes(problem) / 1e6:.1f} MB")
+        if measure:
+            seconds = _seconds_a_step(problem)
+            typer.echo(f"time: {seconds:.3g} s a step here, about {_clock(seconds * problem.steps)} in all")
+
+
+@app.command()
+def plot(
+    trajectory: TrajectoryPath,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder; default the trajectory's name.")] = None,
+    movie: Annotated[bool, typer.Option(help="Draw the movie.")] = True,
+) -> None:
+    """Draw frames, energies, errors and a movie."""
+    with one_line_errors():
+        from biem.run.plot import draw_all  # matplotlib loads slowly: only where it is needed
+
+        folder = output or trajectory.with_suffix("")
+        for file in draw_all(read_trajectory(trajectory), folder, movie, lambda frames: tqdm(frames, desc="movie", leave=False)):
+            typer.echo(str(file))
+
+
+@app.command()
+def verify(trajectory: TrajectoryPath) -> None:
+    """Check a trajectory file: schema, finite values, areas and lengths, crossings, energies."""
+    from biem.run.verify import verify as check_all
+
+    with one_line_errors():
+        checks = check_all(read_trajectory(trajectory))
+        for check in checks:
+            typer.echo(f"{'ok    ' if check.passed else 'FAILED'}  {check.name}: {check.detail}")
+        failed = sum(not check.passed for check in checks)
+        if failed:
+            _fail(f"{failed} of {len(checks)} checks failed on {trajectory}", 3)
+
+
+def _load(path: Path, solver: str | None, overrides: list[str] | None) -> Scene:
+    return load_scene(path, [*(overrides or []), *([f'solver.kind="{solver}"'] if solver else [])])
+
+
+def _in_flow_times(problem: Problem) -> str:
+    unit = problem.flow.time_scale
+    return f" ({problem.dt / unit:.4g} t_gamma) to {problem.horizon / unit:.4g} t_gamma" if unit else f" to t = {problem.horizon:.6g}"
+
+
+def _seconds_a_step(problem: Problem) -> float:
+    """Wall time of the second of two steps: the first one compiles and plans."""
+    stepper = make_stepper(problem, area(problem.X), length(problem.X))
+    with fft_backend(problem.X.size):
+        state = stepper.step(State(0.0, problem.X), problem.dt).state
+        begin = time.perf_counter()
+        stepper.step(state, problem.dt)
+        return time.perf_counter() - begin
+
+
+def _clock(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def _summary(trajectory: Trajectory, path: Path, counts: Counter[str]) -> str:
+    d = trajectory.diagnostics
+    seconds = float((d["wall_seconds"][1:] * np.diff(trajectory.step)).sum())
+    lines = [
+        f"{len(trajectory)} frames to t = {trajectory.t[-1]:.6g} in {_clock(seconds)} of stepping: {path}",
+        f"largest error of a step, before correction: area {d['area_error'].max():.1e}, length {d['length_error'].max():.1e}",
+    ]
+    if trajectory.X.shape[1] > 1:
+        lines.append(f"smallest gap {d['min_gap'].min():.4g}; at most {d['gmres_iterations'].max():.0f} GMRES iterations a step")
+    lines.append("used: " + ", ".join(f"{name} {n}" for name, n in sorted(counts.items())))
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,140 @@
+"""What NumPy and PyTorch do differently, in one place: FFT, dense solves, scatter, conversion, counting.
+
+Array code in `biem` is written once through the array API standard; device and dtype come from the inputs.
+Importing this module imports no torch.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar, copy_context
+from functools import cache, lru_cache
+from typing import Any
+
+import numpy as np
+import scipy.fft
+from array_api_compat import array_namespace, device, is_numpy_array, is_numpy_namespace, is_torch_array
+
+Array = Any  # a NumPy array or a PyTorch tensor
+
+# Total size of one batched transform above which FFTW's planning overhead is paid back (docs/measurements.md).
+FFTW_PAYS_ABOVE = 50_000
+
+_counts: ContextVar[Counter[str] | None] = ContextVar("counts", default=None)
+
+
+@contextmanager
+def counting() -> Iterator[Counter[str]]:
+    """Count what is built and evaluated inside the block: `with counting() as counts: ...; counts["pair_sum"]`."""
+    counts: Counter[str] = Counter()
+    token = _counts.set(counts)
+    try:
+        yield counts
+    finally:
+        _counts.reset(token)
+
+
+def count(name: str, n: int = 1) -> None:
+    """Add n to the counter `name` of the innermost `counting()` block, if there is one."""
+    counts = _counts.get()
+    if counts is not None:
+        counts[name] += n
+
+
+def fft_backend(size: int) -> Any:
+    """Context in which SciPy's FFTs of NumPy arrays run on FFTW, if arrays of `size` values are large enough for it to pay."""
+    if size < FFTW_PAYS_ABOVE:
+        return nullcontext()
+    import pyfftw.interfaces
+
+    pyfftw.interfaces.cache.enable()
+    return scipy.fft.set_backend(pyfftw.interfaces.scipy_fft)
+
+
+def rfft(f: Array) -> Array:
+    """Real FFT along the last axis."""
+    xp = array_namespace(f)
+    return scipy.fft.rfft(f) if is_numpy_namespace(xp) else xp.fft.rfft(f)
+
+
+def irfft(f_hat: Array, n: int) -> Array:
+    """Inverse of `rfft` for n real values along the last axis."""
+    xp = array_namespace(f_hat)
+    return scipy.fft.irfft(f_hat, n) if is_numpy_namespace(xp) else xp.fft.irfft(f_hat, n=n)
+
+
+def to_numpy(a: Array) -> np.ndarray:
+    """The values as a NumPy array (no copy where the memory allows it)."""
+    return a.detach().cpu().numpy() if is_torch_array(a) else np.asarray(a)
+
+
+def from_numpy(a: np.ndarray, like: Array) -> Array:
+    """A NumPy array on the device of `like`; floating values take its dtype."""
+    if is_numpy_array(like):
+        return a.astype(like.dtype, copy=False) if a.dtype.kind == "f" else a
+    xp = array_namespace(like)
+    return xp.asarray(a, dtype=like.dtype if a.dtype.kind == "f" else None, device=device(like))
+
+
+def solve(A: Array, b: Array) -> Array:
+    """Batched dense solve. On the CPU always LAPACK through NumPy.
+
+    PyTorch's batched LU on the CPU returns wrong values for n >= 160 with two threads (seen with torch 2.13).
+    """
+    if is_torch_array(A) and A.device.type != "cpu":
+        return array_namespace(A).linalg.solve(A, b)
+    return from_numpy(np.linalg.solve(to_numpy(A), to_numpy(b)), like=A)
+
+
+def scatter_add(u: Array, index: Array, values: Array) -> Array:
+    """u with values added at the rows `index` (repeated rows add up). u: (P, ...), index: (Q,), values: (Q, ...)."""
+    if is_torch_array(u):
+        return u.index_add(0, index, values)
+    out = u.copy()
+    np.add.at(out, index, values)
+    return out
+
+
+def threads() -> int:
+    """Threads to use: OMP_NUM_THREADS where it is set, else the cores that this process may run on."""
+    return max(1, int(os.environ.get("OMP_NUM_THREADS") or len(os.sched_getaffinity(0))))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads())
+
+
+@cache
+def _blas() -> Any:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")
+
+
+def one_blas_thread() -> Any:
+    """Context with BLAS on one thread: batches of small matrices gain nothing from more, and results do not depend on their number."""
+    return _blas().limit(limits=1)
+
+
+def parallel_map(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """[function(item) for item in items], on threads; BLAS is kept to one thread in each. Counts of `counting()` are kept."""
+    with one_blas_thread():
+        if len(items) == 1 or threads() == 1:
+            return [function(item) for item in items]
+        contexts = [copy_context() for _ in items]
+        return list(_pool().map(lambda c, item: c.run(function, item), contexts, items))
+
+
+@lru_cache(maxsize=256)
+def _cached(function: Any, args: tuple[Any, ...]) -> np.ndarray:
+    return function(*args)
+
+
+def constant(function: Any, *args: Any, like: Array) -> Array:
+    """A table that depends on sizes alone, computed once in float64 and handed out on the device of `like`."""
+    return from_numpy(_cached(function, args), like)

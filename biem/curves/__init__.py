@@ -1,0 +1,1 @@
+"""Closed curves by their nodes: Fourier calculus, geometry, shapes, redistribution, corrections."""

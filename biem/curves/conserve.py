@@ -1,0 +1,61 @@
+"""Area and length restored exactly, by the smallest displacement of the membrane.
+
+    X~ = X + lambda_1 n + lambda_2 c n     (n: gradient of the area, -c n: of the length)     with area(X~) = A_0, length(X~) = L_0
+
+Both directions are taken at X; two equations in (lambda_1, lambda_2) per vesicle are solved by Newton's method, batched.
+"""
+
+from __future__ import annotations
+
+from array_api_compat import array_namespace
+
+from biem.backend import Array
+from biem.curves.curve import area, center_of_nodes, cross, curvature, dot, length, normal, tangent
+from biem.curves.fourier import derivative, remove_nyquist
+from biem.errors import NumericalFailure
+
+TOLERANCE = 1e-10  # relative, of area and of length
+MAX_ITERATIONS = 60
+
+
+def restore_area_length(X: Array, area_0: Array, length_0: Array) -> tuple[Array, int]:
+    """X (M, 2, N) with area and length equal to area_0, length_0 (M,) to 1e-10, and how many vesicles were changed.
+
+    Vesicles within the tolerance are returned as they are. On a circle the two gradients are parallel: the least-squares step is
+    taken there. Raises NumericalFailure, naming the vesicle, where no such shape is near.
+    """
+    xp = array_namespace(X)
+    off = _errors(X, area_0, length_0)
+    wrong = xp.max(xp.abs(off), axis=-1) > TOLERANCE
+    changed = int(xp.sum(xp.astype(wrong, xp.int64)))
+    if changed == 0:
+        return X, 0
+    n = remove_nyquist(normal(X))
+    directions = [n, remove_nyquist((curvature(X) * length_0[:, None] / (2 * xp.pi))[:, None, :] * n)]
+    Y = X
+    for _ in range(MAX_ITERATIONS):
+        J = xp.stack([_derivatives(Y, d, area_0, length_0) for d in directions], axis=-1)
+        lambdas = xp.matmul(xp.linalg.pinv(J, rtol=1e-12), -off[..., None])[..., 0]
+        step = lambdas[:, 0, None, None] * directions[0] + lambdas[:, 1, None, None] * directions[1]
+        Y = xp.where((xp.max(xp.abs(off), axis=-1) > TOLERANCE)[:, None, None], Y + step, Y)
+        off = _errors(Y, area_0, length_0)
+        if float(xp.max(xp.abs(off))) <= TOLERANCE:
+            return Y, changed
+    worst = int(xp.argmax(xp.max(xp.abs(off), axis=-1)))
+    raise NumericalFailure(
+        f"area and length of vesicle {worst} could not be restored: relative errors {float(off[worst, 0]):.1e}, "
+        f"{float(off[worst, 1]):.1e} after {MAX_ITERATIONS} iterations; use smaller steps"
+    )
+
+
+def _errors(X: Array, area_0: Array, length_0: Array) -> Array:
+    return array_namespace(X).stack([area(X) / area_0 - 1.0, length(X) / length_0 - 1.0], axis=-1)
+
+
+def _derivatives(X: Array, d: Array, area_0: Array, length_0: Array) -> Array:
+    """Directional derivatives (M, 2) of the relative area and length along d (M, 2, N)."""
+    xp = array_namespace(X)
+    h = 2.0 * xp.pi / X.shape[-1]
+    dA = xp.sum(cross(d, derivative(X - center_of_nodes(X))), axis=-1) * h
+    dL = xp.sum(dot(tangent(X), derivative(d)), axis=-1) * h
+    return xp.stack([dA / area_0, dL / length_0], axis=-1)

@@ -1,0 +1,110 @@
+"""Many vesicles without overlap: a regular grid, or a random packing by hard-particle Monte Carlo moves.
+
+Shapes are (M, 2, N) about the origin with their long axis along x; boxes are (width, height) with the corner at the origin.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from scipy import optimize
+from scipy.spatial import cKDTree
+
+from biem.curves.crossing import polygons
+from biem.curves.shapes import place
+
+MOVES = 60  # accepted or not, of each vesicle
+MOST_MOVES = 2000
+LARGEST_TURN = 1.5  # rad
+LARGEST_GROWTH = 1.1
+
+
+def grid(shapes: np.ndarray, box: tuple[float, float], gap: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (M, 2) and angles (M,) of a grid with at least `gap` between neighbours.
+
+    Raises ValueError, naming the largest count that fits, if the box is too small.
+    """
+    M = shapes.shape[0]
+    cell = np.ptp(shapes, axis=2).max(axis=0) + gap
+    fits = np.floor((np.asarray(box) + 1e-12) / cell).astype(int)
+    if fits.prod() < M:
+        raise ValueError(
+            f"{M} vesicles of {cell[0] - gap:.3g} x {cell[1] - gap:.3g} with gaps of {gap:g} do not fit into a box of "
+            f"{box[0]:g} x {box[1]:g}: at most {fits.prod()} do; enlarge the box or lower count, area_fraction or gap"
+        )
+    # fewest columns and rows that hold M, as evenly stretched as they can be
+    options = [(nx, -(-M // nx)) for nx in range(1, fits[0] + 1) if -(-M // nx) <= fits[1]]
+    nx, ny = min(options, key=lambda n: abs(np.log((box[0] / n[0] / cell[0]) / (box[1] / n[1] / cell[1]))))
+    k = np.arange(M)
+    spread = np.floor(k * (nx * ny) / M).astype(int)  # leave holes evenly
+    centers = np.stack([(spread % nx + 0.5) * box[0] / nx, (spread // nx + 0.5) * box[1] / ny], axis=1)
+    return centers, np.zeros(M)
+
+
+def random_packing(
+    shapes: np.ndarray, box: tuple[float, float], gap: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (M, 2) and angles (M,) of a random packing inside the box, no two membranes closer than `gap`.
+
+    Starts from randomly turned vesicles, small enough to turn freely on a square grid; every move may also grow its vesicle, up to full
+    size. One vesicle in every other cell of a checkerboard moves at a time: moves in different cells cannot meet. Raises ValueError
+    where full size is not reached.
+    """
+    M = len(shapes)
+    width = np.asarray(box, dtype=np.float64)
+    radius = float(np.sqrt((shapes**2).sum(axis=1)).max())
+    pitch = optimize.brentq(lambda c: np.prod(np.maximum(np.floor(width / c), 0)) - M + 0.5, 1e-9 * width.min(), 2 * width.max())
+    pitch *= 1 - 1e-9
+    per_row = np.floor(width / pitch).astype(int)
+    slot = rng.permutation(per_row.prod())[:M]
+    centers = (np.stack([slot % per_row[0], slot // per_row[0]], axis=1) + 0.5) * width / per_row
+    angles = rng.uniform(-np.pi, np.pi, size=M)
+    size = np.full(M, min(1.0, (pitch - gap) / (2 * radius)))
+    if size[0] <= 0:
+        raise ValueError(f"{M} vesicles with gaps of {gap:g} do not fit into a box of {box[0]:g} x {box[1]:g}: enlarge it or lower gap")
+
+    outline = np.stack([np.asarray(p.exterior.coords.xy) for p in polygons(shapes)])
+    cell = 2.0 * radius + gap
+    moved = np.zeros(M, dtype=int)
+
+    def corners(index: np.ndarray, x: np.ndarray, a: np.ndarray, grown: np.ndarray) -> np.ndarray:
+        c, s = (grown * np.cos(a))[:, None], (grown * np.sin(a))[:, None]
+        px, py = outline[index, 0], outline[index, 1]
+        return np.stack([c * px - s * py + x[:, :1], s * px + c * py + x[:, 1:]], axis=-1)
+
+    now = np.asarray(shapely.polygons(corners(np.arange(M), centers, angles, size)))
+    while moved.mean() < MOVES or size.min() < 1.0:
+        if moved.mean() > MOST_MOVES:
+            raise ValueError(
+                f"no random packing of {M} vesicles in a box of {box[0]:g} x {box[1]:g} was found ({(size < 1).sum()} did not fit after "
+                f"{MOST_MOVES} moves each): lower count, area_fraction or gap, or use placement = \"grid\""
+            )
+        offset = rng.uniform(0.0, 2.0 * cell, size=2)
+        index = np.floor((centers + offset) / cell).astype(int)
+        active = np.flatnonzero(((index + rng.integers(0, 2, size=2)) % 2 == 0).all(axis=1))
+        if len(active) == 0:
+            continue
+        active = rng.permutation(active)
+        _, first = np.unique(index[active], axis=0, return_index=True)
+        chosen = active[np.sort(first)]
+        moved[chosen] += 1
+        step = rng.uniform(0.02, 1.0, size=len(chosen)) ** 2  # small moves are the ones accepted where it is crowded
+        x = centers[chosen] + step[:, None] * rng.normal(scale=radius, size=(len(chosen), 2))
+        a = angles[chosen] + step * rng.uniform(-LARGEST_TURN, LARGEST_TURN, size=len(chosen))
+        grown = np.minimum(1.0, size[chosen] * rng.uniform(1.0, LARGEST_GROWTH, size=len(chosen)))
+        new = corners(chosen, x, a, grown)
+        free = (np.floor((x + offset) / cell).astype(int) == index[chosen]).all(axis=1)
+        free &= ((new.min(axis=1) >= 0.5 * gap) & (new.max(axis=1) <= width - 0.5 * gap)).all(axis=1)
+        candidates = np.asarray(shapely.polygons(new))
+        near = cKDTree(x).sparse_distance_matrix(cKDTree(centers), cell, output_type="ndarray")
+        near = near[chosen[near["i"]] != near["j"]]
+        close = shapely.dwithin(candidates[near["i"]], now[near["j"]], gap)
+        free[np.unique(near["i"][close])] = False
+        accepted = chosen[free]
+        centers[accepted], angles[accepted], size[accepted], now[accepted] = x[free], a[free], grown[free], candidates[free]
+    return centers, angles
+
+
+def assemble(shapes: np.ndarray, centers: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Shapes (M, 2, N) turned and moved to their places."""
+    return np.stack([place(X, c, a) for X, c, a in zip(shapes, centers, angles, strict=True)])

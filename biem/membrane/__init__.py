@@ -1,0 +1,1 @@
+"""Elastic membranes: forces, boundary operators, and the maps that split steppers use."""

@@ -1,0 +1,33 @@
+"""The step guard: what is not a valid state is rejected, with the numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from biem.backend import Array, to_numpy
+from biem.curves.crossing import pair_crossings, self_crossings
+from biem.errors import NumericalFailure
+
+
+def check_state(X: Array, sigma: Array | None, diagnostics: Mapping[str, float], max_error: float) -> None:
+    """Raises NumericalFailure for non-finite values, area or length errors above max_error, and crossing membranes."""
+    values = to_numpy(X)
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=(1, 2)))
+    if len(bad):
+        raise NumericalFailure(f"vesicle {bad[0]} has non-finite nodes ({len(bad)} vesicle(s) do)")
+    if sigma is not None and not np.isfinite(to_numpy(sigma)).all():
+        raise NumericalFailure("the tension is not finite")
+    for name in ("area", "length"):
+        error = diagnostics[f"{name}_error"]
+        if not error <= max_error:
+            raise NumericalFailure(
+                f"{name} of vesicle {int(diagnostics[f'{name}_error_vesicle'])} is off by {error:.2e} (solver.max_error = {max_error:g})"
+            )
+    crossed = self_crossings(values)
+    if crossed:
+        raise NumericalFailure(f"vesicle {crossed[0]} crosses itself")
+    pairs = pair_crossings(values)
+    if pairs:
+        raise NumericalFailure(f"vesicles {pairs[0][0]} and {pairs[0][1]} cross ({len(pairs)} pair(s) in all)")

@@ -1,0 +1,171 @@
+"""Pictures of a trajectory: frames, energies and errors, a movie; for pairs their separation, for channels the lateral position."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import animation
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from biem.backend import to_numpy
+from biem.curves.curve import centroid, effective_radius
+from biem.curves.fourier import resample
+from biem.run.trajectory import Trajectory
+
+FACE, EDGE = "#e8a33d", "#7a3b00"
+SNAPSHOTS = 6
+MOVIE_FRAMES = 100
+LEAST_CORNERS = 128
+
+
+def draw_all(trajectory: Trajectory, folder: Path, movie: bool = True, progress: Callable[[Any], Any] = iter) -> list[Path]:
+    """All pictures that this trajectory has, as files in `folder`; returns their paths. Raises ValueError for an empty one."""
+    if len(trajectory) == 0:
+        raise ValueError("the trajectory has no frames: there is nothing to draw")
+    folder.mkdir(parents=True, exist_ok=True)
+    time, unit = _times(trajectory)
+    files = [_snapshots(trajectory, time, unit, folder / "frames.png"), _history(trajectory, time, unit, folder / "energy.png")]
+    scene = json.loads(trajectory.attributes["scene"])
+    if trajectory.X.shape[1] == 2:
+        files.append(_separation(trajectory, time, unit, folder / "separation.png"))
+    if scene["flow"]["kind"] == "poiseuille":
+        files.append(_lateral(trajectory, time, unit, folder / "lateral.png"))
+    if movie and len(trajectory) > 1:
+        files += _movie(trajectory, time, unit, folder / "movie", progress)
+    return files
+
+
+def separation(trajectory: Trajectory) -> np.ndarray:
+    """Distance of the centroids of two vesicles over R (F,)."""
+    c = np.stack([centroid(X) for X in trajectory.X])
+    return np.hypot(*(c[:, 0] - c[:, 1]).T) / float(np.mean(effective_radius(trajectory.X[0])))
+
+
+def _times(trajectory: Trajectory) -> tuple[np.ndarray, str]:
+    """Times in units of the flow where it has one."""
+    t_gamma = trajectory.attributes["t_gamma"]
+    return (trajectory.t / t_gamma, r"$t / t_{\dot\gamma}$") if t_gamma else (trajectory.t, "$t$")
+
+
+def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, np.ndarray]:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, np.atleast_1d(figure.subplots(rows, columns, **options))
+
+
+def _outlines(X: np.ndarray) -> np.ndarray:
+    """Polygon corners (M, P, 2)."""
+    X = to_numpy(X)
+    return resample(X, max(LEAST_CORNERS, X.shape[-1])).transpose(0, 2, 1)
+
+
+def _view(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre (F, 2) and half width (2,) of a window of fixed size that holds every frame, moving where that makes it smaller."""
+    low, high = X.min(axis=(1, 3)), X.max(axis=(1, 3))
+    fixed = np.broadcast_to((low.min(axis=0) + high.max(axis=0)) / 2, low.shape)
+    still = (high.max(axis=0) - low.min(axis=0)) / 2
+    moving = (low + high) / 2
+    follow = ((high - low) / 2).max(axis=0)
+    center = np.where(follow < 0.5 * still, moving, fixed)
+    half = np.where(follow < 0.5 * still, follow, still) * 1.08
+    return center, np.maximum(half, 0.35 * half.max())
+
+
+def _draw(axes: Any, X: np.ndarray, center: np.ndarray, half: np.ndarray) -> PolyCollection:
+    shapes = PolyCollection(list(_outlines(X)), facecolor=FACE, edgecolor=EDGE, linewidth=0.8)
+    axes.add_collection(shapes)
+    axes.set_aspect("equal")
+    axes.set_xlim(center[0] - half[0], center[0] + half[0])
+    axes.set_ylim(center[1] - half[1], center[1] + half[1])
+    return shapes
+
+
+def _snapshots(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) -> Path:
+    chosen = np.unique(np.linspace(0, len(trajectory) - 1, SNAPSHOTS).round().astype(int))
+    center, half = _view(trajectory.X)
+    wide = half[0] > 2.0 * half[1]
+    columns = 1 if wide and half[0] > 5 * half[1] else min(len(chosen), 2 if wide else 3)
+    rows = -(-len(chosen) // columns)
+    width = 10.0
+    height = rows * (width / columns * half[1] / half[0] + 0.5)
+    figure, axes = _figure(width, max(2.0, min(height, 14.0)), rows, columns, squeeze=False)
+    for ax in axes.flat[len(chosen) :]:
+        ax.axis("off")
+    for ax, k in zip(axes.flat, chosen, strict=False):
+        _draw(ax, trajectory.X[k], center[k], half)
+        ax.set_title(f"{unit} = {time[k]:.4g}", fontsize=9)
+        ax.tick_params(labelsize=7)
+    figure.savefig(path, dpi=130)
+    return path
+
+
+def _history(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) -> Path:
+    d = trajectory.diagnostics
+    figure, axes = _figure(7.0, 7.0, 3, 1, sharex=True)
+    axes[0].plot(time, d["bending_energy"], color=EDGE)
+    axes[0].set_ylabel("bending energy")
+    for name, label in (("area_error", "area"), ("length_error", "length")):
+        axes[1].semilogy(time[1:], np.maximum(d[name][1:], 1e-17), label=label)
+    axes[1].set_ylabel("relative error of a step,\nbefore correction")
+    axes[1].legend(frameon=False)
+    if trajectory.X.shape[1] > 1:
+        axes[2].semilogy(time, d["min_gap"], color="tab:green")
+        axes[2].set_ylabel("smallest gap")
+    else:
+        axes[2].plot(time[1:], d["wall_seconds"][1:], color="tab:gray")
+        axes[2].set_ylabel("seconds a step")
+    axes[2].set_xlabel(unit)
+    figure.savefig(path, dpi=130)
+    return path
+
+
+def _separation(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) -> Path:
+    figure, axes = _figure(6.5, 4.0)
+    axes[0].plot(time, separation(trajectory), color=EDGE)
+    axes[0].set_xlabel(unit)
+    axes[0].set_ylabel("separation of the centroids / R")
+    axes[0].grid(alpha=0.3)
+    figure.savefig(path, dpi=130)
+    return path
+
+
+def _lateral(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) -> Path:
+    y = np.stack([centroid(X)[:, 1] for X in trajectory.X]) / trajectory.attributes["flow_width"]
+    figure, axes = _figure(6.5, 4.0)
+    axes[0].plot(time, y, color=EDGE, linewidth=0.8, alpha=max(0.1, y.shape[1] ** -0.5))
+    axes[0].set_xlabel(unit)
+    axes[0].set_ylabel("lateral position y / W")
+    axes[0].grid(alpha=0.3)
+    figure.savefig(path, dpi=130)
+    return path
+
+
+def _movie(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path, progress: Callable[[Any], Any]) -> list[Path]:
+    """GIF, and MP4 where ffmpeg is installed."""
+    chosen = np.unique(np.linspace(0, len(trajectory) - 1, MOVIE_FRAMES).round().astype(int))
+    center, half = _view(trajectory.X)
+    width = 7.0
+    figure, axes = _figure(width, max(2.2, min(9.0, width * half[1] / half[0] + 0.8)))
+    shapes = _draw(axes[0], trajectory.X[0], center[0], half)
+    title = axes[0].set_title("")
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # the layout is settled: nothing jumps
+    writers: dict[Path, animation.AbstractMovieWriter] = {path.with_suffix(".gif"): animation.PillowWriter(fps=15)}
+    if shutil.which("ffmpeg"):
+        writers[path.with_suffix(".mp4")] = animation.FFMpegWriter(fps=15)
+    for file, writer in writers.items():
+        with writer.saving(figure, str(file), dpi=90):
+            for k in progress(chosen):
+                shapes.set_verts(list(_outlines(trajectory.X[k])))
+                axes[0].set_xlim(center[k, 0] - half[0], center[k, 0] + half[0])
+                axes[0].set_ylim(center[k, 1] - half[1], center[k, 1] + half[1])
+                title.set_text(f"{unit} = {time[k]:.2f}" if time[-1] > 1e-2 else f"{unit} = {time[k]:.3e}")
+                writer.grab_frame()
+    return list(writers)

@@ -1,0 +1,164 @@
+"""Trajectory files: every committed frame stays readable, whenever the writer is killed.
+
+out.h5: t (F,), step (F,), X (F, M, 2, N), sigma (F, M, N) where the solver has a tension, diagnostics/* (F,), attributes.
+While a run is writing, new frames lie one file each in out.h5.frames/ and are merged into out.h5 from time to time and at the end;
+`read_trajectory` reads both. Every file appears by a rename after a sync.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from biem.run.files import atomic_h5
+
+SCHEMA = 1
+DIAGNOSTICS = ("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap")
+MERGE_AT = 64  # loose frames, at least; more where the file is longer, so that merging costs a constant factor
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Frames: t (F,), step (F,), X (F, M, 2, N), sigma (F, M, N) or None; diagnostics: name -> (F,).
+
+    area_error and length_error are the largest relative errors of a step since the last frame, before correction; bending_energy is
+    the suspension's; gmres_iterations the most since the last frame; wall_seconds the mean of a step since then; min_gap is at t.
+    """
+
+    t: np.ndarray
+    step: np.ndarray
+    X: np.ndarray
+    sigma: np.ndarray | None
+    diagnostics: Mapping[str, np.ndarray]
+    attributes: Mapping[str, Any]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def until(self, step: int) -> Trajectory:
+        """The frames up to a step."""
+        keep = self.step <= step
+        return replace(
+            self,
+            t=self.t[keep],
+            step=self.step[keep],
+            X=self.X[keep],
+            sigma=None if self.sigma is None else self.sigma[keep],
+            diagnostics={name: values[keep] for name, values in self.diagnostics.items()},
+        )
+
+
+def one_frame(t: float, step: int, X: np.ndarray, sigma: np.ndarray | None, diagnostics: Mapping[str, float]) -> Trajectory:
+    """A trajectory of one frame."""
+    values = {name: np.array([diagnostics[name]], dtype=np.float64) for name in DIAGNOSTICS}
+    return Trajectory(np.array([t]), np.array([step]), X[None], None if sigma is None else sigma[None], values, {})
+
+
+def join(parts: list[Trajectory], attributes: Mapping[str, Any]) -> Trajectory:
+    """Frames of all parts in turn. Tension is kept where every frame has it but the initial one, which then shows zero."""
+    with_tension = [p for p in parts if p.sigma is not None]
+    sigma = None
+    if with_tension:
+        sigma = np.concatenate([np.zeros((len(p), *p.X.shape[1:2], p.X.shape[3])) if p.sigma is None else p.sigma for p in parts])
+    diagnostics = {name: np.concatenate([p.diagnostics[name] for p in parts]) for name in DIAGNOSTICS}
+    t, step, X = (np.concatenate([getattr(p, name) for p in parts]) for name in ("t", "step", "X"))
+    return Trajectory(t, step, X, sigma, diagnostics, dict(attributes))
+
+
+def read_trajectory(path: str | Path) -> Trajectory:
+    """All committed frames of a trajectory file, finished or being written. Raises ValueError if it is none."""
+    path = Path(path)
+    parts = [_read(path)]
+    attributes = parts[0].attributes
+    done = int(parts[0].step[-1]) if len(parts[0]) else -1
+    for frame in _loose(path):
+        try:
+            part = _read(frame)
+        except FileNotFoundError:  # merged meanwhile: it is in the file now
+            return read_trajectory(path)
+        if int(part.step[0]) > done:
+            parts.append(part)
+    return join(parts, attributes)
+
+
+class TrajectoryWriter:
+    """Appends frames to `path`; `close` leaves one plain file."""
+
+    def __init__(self, path: Path, attributes: Mapping[str, Any], frames: list[Trajectory]) -> None:
+        """Starts the file with the given frames (those before a restart, or the initial one), replacing what was there."""
+        self.path = path
+        self.attributes = dict(attributes)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        merged = join(frames, self.attributes)
+        self._write(path, merged)
+        shutil.rmtree(_folder(path), ignore_errors=True)
+        self._merged = len(merged)
+        self._pending = 0
+
+    def append(self, frame: Trajectory) -> None:
+        """Commits one frame."""
+        folder = _folder(self.path)
+        folder.mkdir(exist_ok=True)
+        self._write(folder / f"{int(frame.step[0]):012d}.h5", frame)
+        self._pending += 1
+        if self._pending >= max(MERGE_AT, self._merged):
+            self._merge()
+
+    def close(self) -> None:
+        """Merges what is loose."""
+        if self._pending:
+            self._merge()
+        shutil.rmtree(_folder(self.path), ignore_errors=True)
+
+    def _merge(self) -> None:
+        everything = read_trajectory(self.path)
+        self._write(self.path, everything)
+        for frame in _loose(self.path):
+            frame.unlink()
+        self._merged, self._pending = len(everything), 0
+
+    def _write(self, path: Path, frames: Trajectory) -> None:
+        with atomic_h5(path) as file:
+            for name in ("t", "step", "X"):
+                file[name] = getattr(frames, name)
+            if frames.sigma is not None:
+                file["sigma"] = frames.sigma
+            for name, values in frames.diagnostics.items():
+                file[f"diagnostics/{name}"] = values
+            for name, value in self.attributes.items():
+                file.attrs[name] = value
+
+
+def exists(path: Path) -> bool:
+    """Whether a trajectory, or what a killed run left of one, is there."""
+    return path.exists() or _folder(path).exists()
+
+
+def _folder(path: Path) -> Path:
+    return path.with_name(path.name + ".frames")
+
+
+def _loose(path: Path) -> list[Path]:
+    return sorted(_folder(path).glob("[0-9]*.h5"))
+
+
+def _read(path: Path) -> Trajectory:
+    if not path.exists():
+        raise FileNotFoundError(f"trajectory {path} does not exist")
+    try:
+        with h5py.File(path, "r") as file:
+            missing = {"t", "step", "X", "diagnostics"} - set(file)
+            if missing or file.attrs.get("schema") != SCHEMA:
+                lacks = f"it lacks {', '.join(sorted(missing))}" if missing else f"its schema is {file.attrs.get('schema')}"
+                raise ValueError(f"{path} is not a trajectory of schema {SCHEMA}: {lacks}")
+            sigma = file["sigma"][:] if "sigma" in file else None
+            diagnostics = {name: file["diagnostics"][name][:] for name in DIAGNOSTICS}
+            return Trajectory(file["t"][:], file["step"][:], file["X"][:], sigma, diagnostics, dict(file.attrs))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read as HDF5: {error}") from None

@@ -1,0 +1,1 @@
+"""Scene files, background flows, and what a scene requires."""

@@ -1,0 +1,212 @@
+"""From a validated scene to what a solver takes: initial membranes, flow and times. Physics is checked here, before the first step."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+import h5py
+import numpy as np
+
+from biem.curves.crossing import pair_crossings, polygons, self_crossings
+from biem.curves.curve import area, effective_radius, reduced_area
+from biem.curves.fourier import remove_nyquist
+from biem.curves.packing import assemble, grid, random_packing
+from biem.curves.shapes import ellipse, equilibrium, perturbed
+from biem.scene.config import Scene, Vesicles, time_value
+from biem.scene.flows import BackgroundFlow, capillary_factor, make_flow
+
+SHAPES = {"equilibrium": equilibrium, "ellipse": ellipse}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """X (M, 2, N) at t = 0, the flow, dt and horizon in the scene's units; notices: what was changed in the input."""
+
+    scene: Scene
+    X: np.ndarray
+    flow: BackgroundFlow
+    dt: float
+    horizon: float
+    t_kappa: float
+    notices: tuple[str, ...] = ()
+
+    @property
+    def steps(self) -> int:
+        """Steps to the horizon; the last one is shorter where dt does not divide it."""
+        return max(1, int(np.ceil(self.horizon / self.dt - 1e-9)))
+
+    @property
+    def radius(self) -> float:
+        """R: radius of the circle of the vesicles' mean area."""
+        return float(np.sqrt(np.mean(area(self.X)) / np.pi))
+
+
+def build(scene: Scene) -> Problem:
+    """The problem of a scene. Raises ValueError with one line for what is wrong."""
+    X, notices = _membranes(scene)
+    _check_membranes(X)
+    radius = float(np.sqrt(np.mean(area(X)) / np.pi))
+    flow = _flow(scene, radius)
+    if flow.kind == "rotation":
+        _check_rotation(X)
+    t_kappa = scene.physics.mu * radius**3 / scene.physics.kappa_b
+    units = {"t_gamma": flow.time_scale, "t_kappa": t_kappa}
+    dt = time_value(scene.time.dt, "dt", units)
+    horizon = time_value(scene.time.horizon, "horizon", units)
+    points = scene.solver.operator_points
+    if points is not None and points < X.shape[-1]:
+        raise ValueError(f"solver.operator_points = {points} is below vesicles.points = {X.shape[-1]}: choose at least as many")
+    return Problem(scene, X, flow, dt, horizon, t_kappa, notices)
+
+
+def _membranes(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
+    v = scene.vesicles
+    if v.file is not None:
+        return _from_file(scene)
+    single = _shape(v, np.random.default_rng(v.seed))
+    if v.placement == "explicit":
+        for name in ("count", "area_fraction", "box", "corner"):
+            if getattr(v, name) is not None:
+                raise ValueError(f'vesicles.{name} goes with placement = "grid" or "random"; "explicit" takes centers and angles')
+        centers = np.array([(0.0, 0.0)] if v.centers is None else v.centers, dtype=np.float64).reshape(-1, 2)
+        if len(centers) == 0:
+            raise ValueError("vesicles.centers is empty: give at least one centre")
+        angles = np.zeros(len(centers)) if v.angles is None else np.asarray(v.angles, dtype=np.float64)
+        if len(angles) != len(centers):
+            raise ValueError(f"vesicles.angles has {len(angles)} entries for {len(centers)} centers: give one angle for each centre")
+        if v.unit == "R":
+            centers = centers * float(effective_radius(single[None])[0])
+        shapes = _shapes(v, single, len(centers))
+        return assemble(shapes, centers, angles), ()
+    if v.centers is not None or v.angles is not None:
+        raise ValueError('vesicles.centers and angles go with placement = "explicit"')
+    count, box = _count_and_box(v, float(area(single[None])[0]))
+    shapes = _shapes(v, single, count)
+    gap = v.gap * v.length
+    if v.placement == "grid":
+        centers, angles = grid(shapes, box, gap)
+    else:
+        centers, angles = random_packing(shapes, box, gap, np.random.default_rng([v.seed, 1]))
+    corner = (-box[0] / 2, -box[1] / 2) if v.corner is None else v.corner
+    return assemble(shapes, centers + np.asarray(corner), angles), ()
+
+
+def _shape(v: Vesicles, rng: np.random.Generator) -> np.ndarray:
+    if v.shape == "perturbed":
+        return perturbed(v.points, v.reduced_area, v.length, rng)
+    return SHAPES[v.shape](v.points, v.reduced_area, v.length)
+
+
+def _shapes(v: Vesicles, single: np.ndarray, count: int) -> np.ndarray:
+    """count shapes; perturbed ones differ from each other."""
+    if v.shape == "perturbed":
+        rng = np.random.default_rng(v.seed)
+        return np.stack([_shape(v, rng) for _ in range(count)])
+    return np.repeat(single[None], count, axis=0)
+
+
+def _count_and_box(v: Vesicles, one: float) -> tuple[int, tuple[float, float]]:
+    given = [name for name in ("count", "area_fraction", "box") if getattr(v, name) is not None]
+    if len(given) != 2:
+        raise ValueError(f"vesicles: placement = \"{v.placement}\" needs two of count, area_fraction and box, got {' and '.join(given) or 'none'}")
+    if v.box is None:
+        assert v.count is not None
+        assert v.area_fraction is not None
+        side = float(np.sqrt(v.count * one / v.area_fraction))
+        return v.count, (side, side)
+    if min(v.box) <= 0:
+        raise ValueError(f"vesicles.box = {list(v.box)}: both sides must be positive")
+    if v.count is not None:
+        return v.count, v.box
+    assert v.area_fraction is not None
+    return max(1, round(v.area_fraction * v.box[0] * v.box[1] / one)), v.box
+
+
+def _from_file(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
+    v = scene.vesicles
+    unused = v.model_fields_set - {"file"}
+    if unused:
+        raise ValueError(f"vesicles.file excludes vesicles.{sorted(unused)[0]}: the file holds the shapes and where they are")
+    path = scene.folder / str(v.file)
+    try:
+        with h5py.File(path, "r") as file:
+            if "X" not in file:
+                raise ValueError(f"vesicles.file {path} has no dataset X; it has {', '.join(file) or 'none'}")
+            X = np.asarray(file["X"][-1] if file["X"].ndim == 4 else file["X"], dtype=np.float64)
+    except FileNotFoundError:
+        raise ValueError(f"vesicles.file {path} does not exist (paths are relative to the scene)") from None
+    except OSError as error:
+        raise ValueError(f"vesicles.file {path} cannot be read as HDF5: {error}") from None
+    if X.ndim != 3 or X.shape[1] != 2 or X.shape[0] == 0:
+        raise ValueError(f"vesicles.file {path}: X has shape {X.shape}, expected (M, 2, N)")
+    if X.shape[2] < 16 or X.shape[2] % 2:
+        raise ValueError(f"vesicles.file {path}: X has {X.shape[2]} nodes a vesicle, expected an even number, at least 16")
+    if not np.isfinite(X).all():
+        m, c, k = np.argwhere(~np.isfinite(X))[0]
+        raise ValueError(f"vesicles.file {path}: X is {X[m, c, k]} at vesicle {m}, component {'xy'[c]}, node {k}")
+    gap = np.hypot(*np.moveaxis(X - np.roll(X, -1, axis=-1), 1, 0))
+    if (gap == 0).any():
+        m, k = np.argwhere(gap == 0)[0]
+        raise ValueError(
+            f"vesicles.file {path}: nodes {k} and {(k + 1) % X.shape[2]} of vesicle {m} are the same point; "
+            "a closed curve does not repeat its first node"
+        )
+    clockwise = area(X) < 0
+    notices = []
+    if clockwise.any():
+        X = X.copy()
+        X[clockwise] = np.roll(X[clockwise][:, :, ::-1], 1, axis=-1)
+        notices.append(f"{clockwise.sum()} clockwise vesicle(s) reoriented, the first is {np.flatnonzero(clockwise)[0]}")
+    return remove_nyquist(X), tuple(notices)
+
+
+def _check_membranes(X: np.ndarray) -> None:
+    crossed = self_crossings(X)
+    if crossed:
+        raise ValueError(f"vesicle {crossed[0]} crosses itself ({len(crossed)} in all do): give simple closed curves")
+    pairs = pair_crossings(X)
+    if pairs:
+        i, j = pairs[0]
+        raise ValueError(f"vesicles {i} and {j} overlap ({len(pairs)} pair(s) in all do): move them apart")
+    nu = reduced_area(X)
+    bad = np.flatnonzero(~((nu > 0) & (nu <= 1 + 1e-9)))
+    if len(bad):
+        raise ValueError(f"vesicle {bad[0]} has reduced area {nu[bad[0]]:.6g}: expected a value in (0, 1]; its nodes do not resolve a curve")
+
+
+def _check_rotation(X: np.ndarray) -> None:
+    import shapely
+
+    inside = np.flatnonzero(shapely.intersects_xy(polygons(X), 0.0, 0.0))
+    if len(inside):
+        raise ValueError(f"vesicle {inside[0]} covers the origin, where the flow rotation is singular: move it away")
+
+
+def _flow(scene: Scene, radius: float) -> BackgroundFlow:
+    f = scene.flow
+    strengths = [name for name in ("rate", "u_max", "capillary") if getattr(f, name) is not None]
+    if len(strengths) > 1:
+        raise ValueError(f"flow.{strengths[0]} and flow.{strengths[1]} both set the strength: keep one")
+    if f.kind == "quiescent" and (strengths or f.width or f.confinement or f.function):
+        raise ValueError('flow.kind = "quiescent" takes no other key: remove them or choose another kind')
+    if f.function is not None and f.kind != "custom":
+        raise ValueError('flow.function goes with flow.kind = "custom"')
+    if f.kind in ("shear", "extensional") and (f.width is not None or f.confinement is not None):
+        raise ValueError(f'flow.kind = "{f.kind}" has no width')
+    if f.width is not None and f.confinement is not None:
+        raise ValueError("flow.width and flow.confinement both set the width: keep one")
+    if f.u_max is not None and f.kind not in ("poiseuille", "taylor_green"):
+        raise ValueError(f'flow.u_max goes with poiseuille and taylor_green; give {f.kind} a rate or a capillary number')
+    width = radius / f.confinement if f.confinement else f.width
+    rate = f.rate
+    if f.capillary is not None:
+        physics = scene.physics
+        rate = f.capillary * physics.kappa_b / (capillary_factor(f.kind) * physics.mu * radius**3)
+    elif f.u_max is not None:
+        if width is None:
+            raise ValueError(f"flow {f.kind} needs a width (or a confinement)")
+        rate = f.u_max / width
+    if f.kind == "custom" and str(scene.folder.resolve()) not in sys.path:
+        sys.path.insert(0, str(scene.folder.resolve()))
+    return make_flow(f.kind, rate, width, f.function)

@@ -1,0 +1,182 @@
+"""The scene file: a TOML table per subject, validated; unknown keys are refused with the nearest valid name."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from biem.steppers.corrections import CORRECTIONS
+
+Kind = Literal["quiescent", "shear", "extensional", "poiseuille", "taylor_green", "rotation", "custom"]
+Correction = Literal["redistribute", "area_length"]
+assert set(get_args(Correction)) == set(CORRECTIONS)
+
+
+class Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Physics(Table):
+    """Bending stiffness and viscosity (the same inside and outside), in any consistent units."""
+
+    kappa_b: float = Field(1.0, gt=0)
+    mu: float = Field(1.0, gt=0)
+
+
+class Vesicles(Table):
+    """What is suspended: a file, or shapes of one reduced area and where they are."""
+
+    file: str | None = None  # HDF5 with a dataset X (M, 2, N), or a trajectory: its last frame
+    placement: Literal["explicit", "grid", "random"] = "explicit"
+    shape: Literal["equilibrium", "ellipse", "perturbed"] = "equilibrium"
+    reduced_area: float = Field(0.65, gt=0, le=1)
+    points: int = Field(64, ge=16, multiple_of=2)
+    length: float = Field(1.0, gt=0)
+    seed: int = Field(0, ge=0)
+    centers: list[tuple[float, float]] | None = None  # placement = "explicit"; default one vesicle at the origin
+    angles: list[float] | None = None  # of the long axes from the x axis, rad
+    unit: Literal["length", "R"] = "length"  # of centers: the unit of `length`, or the radius of the circle of equal area
+    count: int | None = Field(None, ge=1)  # placement = "grid" or "random": two of count, area_fraction, box
+    area_fraction: float | None = Field(None, gt=0, lt=1)
+    box: tuple[float, float] | None = None
+    corner: tuple[float, float] | None = None  # of the box; default: the box is centred on the origin
+    gap: float = Field(0.02, ge=0)  # smallest distance of membranes, in lengths
+
+
+class FlowTable(Table):
+    """Background flow; its strength by one of rate, u_max, capillary, its width directly or by the confinement Cn = R/W."""
+
+    kind: Kind = "quiescent"
+    rate: float | None = None
+    u_max: float | None = None
+    capillary: float | None = None
+    width: float | None = Field(None, gt=0)
+    confinement: float | None = Field(None, gt=0)
+    function: str | None = None
+
+
+class Time(Table):
+    """dt and horizon: numbers, or in units of the flow or of bending: "0.01 t_gamma", "2 t_kappa" (t_kappa = mu R^3 / kappa_b)."""
+
+    dt: float | str
+    horizon: float | str
+    save_every: int = Field(1, ge=1)
+
+
+class Solver(Table):
+    """The solver and what it is allowed to do."""
+
+    kind: Literal["implicit"] = "implicit"
+    tolerance: float = Field(1e-10, gt=0, lt=1)  # of GMRES, relative
+    max_iterations: int = Field(200, ge=1)
+    operator_points: int | None = Field(None, ge=16, multiple_of=2)
+    near_field: Literal["auto", "upsample", "ying_zorin", "none"] = "auto"
+    near_tolerance: float = Field(1e-8, gt=0, lt=1)
+    corrections: list[Correction] = ["area_length", "redistribute"]
+    max_error: float = Field(1e-2, gt=0)  # relative error of area or length in one step (since the start, if not corrected)
+
+
+class Output(Table):
+    """trajectory: default path; tension: keep it also where the solver does not need it; checkpoint_every: steps, default save_every."""
+
+    trajectory: str | None = None
+    checkpoint_every: int | None = Field(None, ge=1)
+    tension: bool = False
+
+
+class Scene(Table):
+    """A validated scene. `folder` is where its files are looked for; it is not a key of the file."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
+    physics: Physics = Physics()  # type: ignore[call-arg]
+    vesicles: Vesicles = Vesicles()  # type: ignore[call-arg]
+    flow: FlowTable = FlowTable()  # type: ignore[call-arg]
+    time: Time
+    solver: Solver = Solver()  # type: ignore[call-arg]
+    output: Output = Output()  # type: ignore[call-arg]
+    folder: Path = Field(Path("."), exclude=True)
+
+
+def load_scene(path: str | Path, overrides: Iterable[str] = ()) -> Scene:
+    """The scene in a TOML file, with overrides such as "vesicles.points=32". Raises ValueError with one line for what is wrong."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"scene {path} does not exist: give the path of a TOML file, such as configs/scenes/shear_pair.toml") from None
+    except IsADirectoryError:
+        raise ValueError(f"scene {path} is a folder: give the path of a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"scene {path} is not valid TOML: {error}") from None
+    for override in overrides:
+        _override(table, override)
+    table.setdefault("name", path.stem)
+    return make_scene(table, path.parent)
+
+
+def make_scene(table: dict[str, Any], folder: str | Path = ".") -> Scene:
+    """The scene of a dictionary in the layout of the file. Raises ValueError with one line for what is wrong."""
+    try:
+        return Scene.model_validate({**table, "folder": Path(folder)})
+    except ValidationError as error:
+        raise ValueError("; ".join(_explain(e) for e in error.errors())) from None
+
+
+def time_value(value: float | str, key: str, units: dict[str, float | None]) -> float:
+    """A positive time from a number or "0.01 t_gamma". units: values of the names; None: not defined in this scene."""
+    number: float | None
+    if isinstance(value, str):
+        words = value.split()
+        try:
+            number = float(words[0])
+        except (ValueError, IndexError):
+            number = None
+        if number is None or len(words) > 2 or (len(words) == 2 and words[1] not in units):
+            raise ValueError(f'time.{key} = "{value}": expected a number or a number and a unit, as in "0.01 t_gamma" or "2 t_kappa"')
+        if len(words) == 2:
+            unit = units[words[1]]
+            if unit is None:
+                raise ValueError(f'time.{key} = "{value}": this flow has no {words[1]}; give a number, t_kappa, or a flow with a rate')
+            number *= unit
+    else:
+        number = float(value)
+    if not (number > 0 and math.isfinite(number)):
+        raise ValueError(f"time.{key} = {value}: expected a positive, finite time")
+    return number
+
+
+def _override(table: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        raise ValueError(f'--set {override}: expected key=value, as in "vesicles.points=32"')
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *parents, last = key.strip().split(".")
+    for parent in parents:
+        table = table.setdefault(parent, {})
+        if not isinstance(table, dict):
+            raise ValueError(f"--set {override}: {parent} is not a table")
+    table[last] = value
+
+
+def _explain(error: Any) -> str:
+    path = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        model: Any = Scene
+        for part in error["loc"][:-1]:
+            model = model.model_fields[part].annotation
+        known = [name for name in model.model_fields if name != "folder"]
+        near = difflib.get_close_matches(str(error["loc"][-1]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]}?" if near else "the keys there are " + ", ".join(known)
+        return f"unknown key {path}: {hint}"
+    if error["type"] == "missing":
+        return f"key {path} is missing"
+    return f"{path} = {error['input']!r}: {error['msg'][0].lower()}{error['msg'][1:]}"

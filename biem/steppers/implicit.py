@@ -1,0 +1,220 @@
+"""Fully coupled semi-implicit Euler step: bending, tension and vesicle-vesicle interaction implicit, operators frozen at X^n.
+
+    (X_i - X_i^n)/dt = (1 - M_i)(B_i X_i + u_i),   sigma_i = -L_i^-1 P_i (B_i X_i + u_i),   u_i = u_inf + sum_{j != i} S_j[f(X_j, sigma_j)]
+
+With the coupling velocity u_i given, vesicle i is solved exactly by its own dense block; f_i is then affine in u_i. What is left is
+
+    u - O F u = u_inf + O f_0,      O: single layers between vesicles,  F: block-diagonal response of the force
+
+which is the coupled system right-preconditioned by its exact diagonal blocks, with the velocity as the unknown. GMRES starts from the
+velocity of the present forces, so a step depends on (X^n, sigma^n) alone. Paper, eq. (time_step_sc1); Quaife & Biros (2014).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from array_api_compat import array_namespace
+from scipy.sparse.linalg import LinearOperator, gmres
+
+from biem.backend import Array, constant, count, from_numpy, one_blas_thread, parallel_map, to_numpy
+from biem.curves.curve import arclength_weights
+from biem.curves.fourier import resample, resampling_matrix
+from biem.errors import NumericalFailure
+from biem.membrane.maps import operator_points, relaxation_system
+from biem.membrane.operators import VesicleOperators, bending_force, membrane_force
+from biem.steppers.stepper import Flow, State, StepResult
+from biem.stokes.farfield_direct import direct_sum
+from biem.stokes.near import apply_rows, near_correction, near_width
+from biem.stokes.near_search import find_near
+from biem.stokes.single_layer import near_scheme
+
+CHUNK_VALUES = 1 << 15  # matrix entries per operator of one chunk of vesicles: they stay in the cache
+
+
+@dataclass(frozen=True)
+class ImplicitStepper:
+    """Parameters of the step. flow: background velocity, or None in a fluid at rest.
+
+    points: nodes of the operators (default 2 N below N = 96); tolerance: GMRES, relative; near_tolerance: of the near field;
+    tension: keep sigma also where no other vesicle needs it.
+    """
+
+    kappa_b: float
+    mu: float
+    flow: Flow | None = None
+    points: int | None = None
+    tolerance: float = 1e-10
+    max_iterations: int = 200
+    near_field: str = "auto"
+    near_tolerance: float = 1e-8
+    tension: bool = False
+
+    def step(self, state: State, dt: float) -> StepResult:
+        """The state at t + dt. Raises NumericalFailure if GMRES does not reach the tolerance."""
+        with one_blas_thread():
+            return self._step_alone(state, dt) if state.X.shape[0] == 1 else self._step_coupled(state, dt)
+
+    def _step_coupled(self, state: State, dt: float) -> StepResult:
+        X = state.X
+        u_inf = 0.0 * X if self.flow is None else self.flow(X, state.t)
+        response = self._response(X, dt)
+        coupling = Coupling.build(X, self.mu, near_scheme(self.near_field), self.near_tolerance)
+
+        rhs = u_inf + coupling.velocity(response.force_0)
+        guess = rhs if state.sigma is None else u_inf + coupling.velocity(membrane_force(X, state.sigma, self.kappa_b))
+        u, iterations = self._gmres(lambda v: v - coupling.velocity(response.force(v)), rhs, guess, coupling)
+        new = State(state.t + dt, X + response.increment(u), response.tension(u))
+        return StepResult(new, {"gmres_iterations": iterations})
+
+    def _step_alone(self, state: State, dt: float) -> StepResult:
+        """One vesicle: no coupling, one solve; without flow, relaxation alone."""
+        xp = array_namespace(state.X)
+        ops = self._operators(state.X)
+        N = state.X.shape[-1]
+        velocity = ops.bending_velocity()
+        if self.flow is not None:
+            velocity = velocity + resample(self.flow(state.X, state.t), ops.X.shape[-1])
+        columns = xp.reshape(velocity, (1, -1, 1))
+        increment, tension = relaxation_system(ops, columns, dt, self.tension)
+        sigma = None if tension is None else resample(tension[..., 0], N)
+        return StepResult(State(state.t + dt, state.X + resample(xp.reshape(increment, ops.X.shape), N), sigma), {"gmres_iterations": 0})
+
+    def _operators(self, X: Array) -> VesicleOperators:
+        return VesicleOperators(resample(X, operator_points(X.shape[-1], self.points)), self.kappa_b, self.mu)
+
+    def _response(self, X: Array, dt: float) -> Response:
+        """Increment, tension and force of every vesicle as affine functions of its coupling velocity."""
+        xp = array_namespace(X)
+        M, _, N = X.shape
+        n = operator_points(N, self.points)
+        chunk = max(1, CHUNK_VALUES // (2 * n) ** 2)
+        parts = parallel_map(lambda x: self._response_of(x, dt), [X[start : start + chunk] for start in range(0, M, chunk)])
+        return Response(*(xp.concat([getattr(p, name) for p in parts], axis=0) for name in Response.__dataclass_fields__))
+
+    def _response_of(self, X: Array, dt: float) -> Response:
+        xp = array_namespace(X)
+        ops = self._operators(X)
+        m, _, n = ops.X.shape
+        N = X.shape[-1]
+        count("coupled_response", m)
+        # columns: the bending velocity of X^n, then the interpolated unit velocities of the N nodes, x then y
+        E = constant(resampling_matrix, n, N, like=X)
+        zero = xp.zeros_like(E)
+        basis = xp.concat([xp.concat([E, zero], axis=1), xp.concat([zero, E], axis=1)], axis=0)
+        own = xp.reshape(ops.bending_velocity(), (m, 2 * n, 1))
+        columns = xp.concat([own, xp.broadcast_to(basis, (m, *basis.shape))], axis=-1)
+        increment, tension = relaxation_system(ops, columns, dt, True)
+        D, D4 = ops.D, ops.D4
+        x_s, y_s = ops.tangent[:, 0, :, None], ops.tangent[:, 1, :, None]
+        R = constant(resampling_matrix, N, n, like=X)
+        R_bend, R_tension = -self.kappa_b * xp.matmul(R, D4), xp.matmul(R, D)
+        fx = xp.matmul(R_bend, increment[:, :n]) + xp.matmul(R_tension, x_s * tension)
+        fy = xp.matmul(R_bend, increment[:, n:]) + xp.matmul(R_tension, y_s * tension)
+        force = xp.concat([fx, fy], axis=1)
+        increment = xp.concat([xp.matmul(R, increment[:, :n]), xp.matmul(R, increment[:, n:])], axis=1)
+        tension = xp.matmul(R, tension)
+        force_0 = xp.reshape(force[..., 0], (m, 2, N)) + resample(bending_force(ops.X, self.kappa_b), N)
+        return Response(
+            xp.reshape(increment[..., 0], (m, 2, N)), increment[..., 1:], tension[..., 0], tension[..., 1:], force_0, force[..., 1:]
+        )
+
+    def _gmres(self, apply, rhs: Array, guess: Array, coupling: Coupling) -> tuple[Array, int]:  # type: ignore[no-untyped-def]
+        """u with apply(u) = rhs, and the iterations taken; the true residual is checked."""
+        size = int(np.prod(rhs.shape))
+        iterations = 0
+
+        def matvec(v: np.ndarray) -> np.ndarray:
+            return to_numpy(apply(from_numpy(v.reshape(rhs.shape), like=rhs))).ravel()
+
+        def tick(_: float) -> None:
+            nonlocal iterations
+            iterations += 1
+
+        b = to_numpy(rhs).ravel()
+        solution, _ = gmres(
+            LinearOperator((size, size), matvec=matvec, dtype=b.dtype),
+            b,
+            x0=to_numpy(guess).ravel(),
+            rtol=self.tolerance,
+            atol=0.0,
+            restart=min(size, self.max_iterations),
+            maxiter=1,
+            callback=tick,
+            callback_type="pr_norm",
+        )
+        residual = np.linalg.norm(b - matvec(solution)) / (np.linalg.norm(b) or 1.0)
+        if not residual <= 10.0 * self.tolerance:
+            raise NumericalFailure(
+                f"GMRES stopped at a relative residual of {residual:.1e} (wanted {self.tolerance:.1e}) after {iterations} iterations, "
+                f"smallest gap between nodes and membranes {coupling.gap:.2e}: take smaller steps or more nodes"
+            )
+        return from_numpy(solution.reshape(rhs.shape), like=rhs), iterations
+
+
+@dataclass(frozen=True)
+class Response:
+    """Affine maps u (M, 2, N) -> increment of X, tension, force: constant part and matrix of each."""
+
+    increment_0: Array
+    increment_1: Array
+    tension_0: Array
+    tension_1: Array
+    force_0: Array
+    force_1: Array
+
+    def force(self, u: Array) -> Array:
+        """Linear part of the force (M, 2, N)."""
+        return _apply(self.force_1, u, self.force_0.shape)
+
+    def increment(self, u: Array) -> Array:
+        """X^{n+1} - X^n (M, 2, N)."""
+        return self.increment_0 + _apply(self.increment_1, u, self.increment_0.shape)
+
+    def tension(self, u: Array) -> Array:
+        """sigma^{n+1} (M, N)."""
+        return self.tension_0 + _apply(self.tension_1, u, self.tension_0.shape)
+
+
+def _apply(matrix: Array, u: Array, shape: tuple[int, ...]) -> Array:
+    xp = array_namespace(u)
+    return xp.reshape(xp.matmul(matrix, xp.reshape(u, (u.shape[0], -1, 1))), shape)
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Velocity of each vesicle due to all others, geometry fixed: pair sum plus near rows built once."""
+
+    X: Array
+    mu: float
+    weights: Array
+    targets: Array
+    owner: Array
+    pairs: object
+    rows: Array | None
+    gap: float
+
+    @classmethod
+    def build(cls, X: Array, mu: float, scheme: str, tolerance: float) -> Coupling:
+        xp = array_namespace(X)
+        M, _, N = X.shape
+        targets = xp.reshape(xp.permute_dims(X, (0, 2, 1)), (M * N, 2))
+        owner = from_numpy(np.repeat(np.arange(M), N), like=X)
+        coupling = cls(X, mu, arclength_weights(X)[:, None, :], targets, owner, None, None, float("inf"))
+        if scheme == "none":
+            return coupling
+        pairs = find_near(X, targets, near_width(scheme, tolerance), owner)
+        if len(pairs) == 0:
+            return coupling
+        gap = float(np.abs(pairs.distance).min())
+        return replace(coupling, pairs=pairs, rows=near_correction(X, targets, pairs, mu, scheme, tolerance), gap=gap)
+
+    def velocity(self, f: Array) -> Array:
+        """(M, 2, N) for force densities f (M, 2, N)."""
+        xp = array_namespace(f)
+        M, _, N = f.shape
+        u = direct_sum(self.targets, self.X, f * self.weights, self.mu, self.owner)
+        if self.rows is not None:
+            u = apply_rows(u, self.rows, self.pairs, f)
+        return xp.permute_dims(xp.reshape(u, (M, N, 2)), (0, 2, 1))

@@ -1,0 +1,1 @@
+"""Training data for `surrogate` from simulations with `biem`."""

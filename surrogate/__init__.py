@@ -1,0 +1,1 @@
+"""Neural surrogates of the per-vesicle operators of `biem`."""
