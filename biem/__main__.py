@@ -85,7 +85,9 @@ def plan(
     with one_line_errors():
         problem = build(_load(scene, solver, overrides))
         M, _, N = problem.X.shape
-        typer.echo(f"{problem.scene.name}: {M} vesicle(s) of {N} nodes, {problem.steps} steps of dt = {problem.dt:.6g}{_in_flow_times(problem)}")
+        typer.echo(
+            f"{problem.scene.name}: {M} vesicle(s) of {N} nodes, {problem.steps} steps of dt = {problem.dt:.6g}{_in_flow_times(problem)}"
+        )
         parts = required_parts(problem)
         wide = max(len(p.name) for p in parts)
         for part in parts:

@@ -32,4 +32,3 @@ def pair_crossings(X: Array) -> list[tuple[int, int]]:
     i, j = shapely.STRtree(shapes).query(shapes, predicate="intersects")
     pairs = [(int(a), int(b)) for a, b in zip(i, j, strict=True) if a < b]
     return [(a, b) for a, b in pairs if shapely.intersects(*polygons(X[[a, b]], FINE))]
-

@@ -42,6 +42,14 @@ def resample(f: Array, n: int) -> Array:
     return irfft(xp.concat([kept, zeros], axis=-1), n)
 
 
+def read_back(f: Array, n: int) -> Array:
+    """Values (..., n) of the interpolant of f (..., m), m >= n, at n nodes: no mode is cut off, unlike `resample` to fewer nodes."""
+    m = f.shape[-1]
+    if m % n == 0:
+        return f[..., :: m // n]
+    return array_namespace(f).matmul(f, constant(read_back_matrix, n, m, like=f).T)
+
+
 def remove_nyquist(f: Array) -> Array:
     """f without its Nyquist mode: derivatives do not see that mode, so nothing would ever damp it."""
     xp = array_namespace(f)
@@ -81,6 +89,11 @@ def differentiation_matrix(n: int) -> np.ndarray:
 def resampling_matrix(n: int, m: int) -> np.ndarray:
     """(n, m): `resample` from m to n values."""
     return np.ascontiguousarray(resample(np.eye(m), n).T)
+
+
+def read_back_matrix(n: int, m: int) -> np.ndarray:
+    """(n, m): `read_back` from m to n values."""
+    return interpolation_matrix(2 * np.pi * np.arange(n) / n, m)
 
 
 def interpolation_matrix(alpha: np.ndarray, n: int) -> np.ndarray:

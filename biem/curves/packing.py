@@ -41,9 +41,7 @@ def grid(shapes: np.ndarray, box: tuple[float, float], gap: float) -> tuple[np.n
     return centers, np.zeros(M)
 
 
-def random_packing(
-    shapes: np.ndarray, box: tuple[float, float], gap: float, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def random_packing(shapes: np.ndarray, box: tuple[float, float], gap: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Centres (M, 2) and angles (M,) of a random packing inside the box, no two membranes closer than `gap`.
 
     Starts from randomly turned vesicles, small enough to turn freely on a square grid; every move may also grow its vesicle, up to full
@@ -77,7 +75,7 @@ def random_packing(
         if moved.mean() > MOST_MOVES:
             raise ValueError(
                 f"no random packing of {M} vesicles in a box of {box[0]:g} x {box[1]:g} was found ({(size < 1).sum()} did not fit after "
-                f"{MOST_MOVES} moves each): lower count, area_fraction or gap, or use placement = \"grid\""
+                f'{MOST_MOVES} moves each): lower count, area_fraction or gap, or use placement = "grid"'
             )
         offset = rng.uniform(0.0, 2.0 * cell, size=2)
         index = np.floor((centers + offset) / cell).astype(int)

@@ -13,7 +13,7 @@ from array_api_compat import array_namespace
 
 from biem.backend import Array, count, solve
 from biem.curves.curve import length, normal
-from biem.curves.fourier import resample
+from biem.curves.fourier import read_back, remove_nyquist, resample
 from biem.membrane.operators import VesicleOperators
 from biem.stokes.near import layer_values
 
@@ -69,22 +69,22 @@ class ExactMaps:
     def advect(self, X: Array, u: Array) -> Array:
         ops = self.operators(X)
         u = resample(u, ops.X.shape[-1])
-        return resample(project(ops, u), X.shape[-1])
+        return read_back(project(ops, u), X.shape[-1])
 
     def relax(self, X: Array, dt: float) -> Array:
         xp = array_namespace(X)
         ops = self.operators(X)
         M, _, n = ops.X.shape
         increment, _ = relaxation_system(ops, xp.reshape(ops.bending_velocity(), (M, 2 * n, 1)), dt, False)
-        return X + resample(xp.reshape(increment, (M, 2, n)), X.shape[-1])
+        return X + remove_nyquist(read_back(xp.reshape(increment, (M, 2, n)), X.shape[-1]))
 
     def self_tension(self, X: Array) -> Array:
         ops = self.operators(X)
-        return resample(inextensible_tension(ops, ops.bending_velocity()), X.shape[-1])
+        return read_back(inextensible_tension(ops, ops.bending_velocity()), X.shape[-1])
 
     def flow_tension(self, X: Array, u: Array) -> Array:
         ops = self.operators(X)
-        return resample(inextensible_tension(ops, resample(u, ops.X.shape[-1])), X.shape[-1])
+        return read_back(inextensible_tension(ops, resample(u, ops.X.shape[-1])), X.shape[-1])
 
     def near_layers(self, X: Array, f: Array) -> Array:
         xp = array_namespace(X)

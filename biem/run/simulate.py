@@ -65,9 +65,7 @@ def make_stepper(problem: Problem, area_0: np.ndarray, length_0: np.ndarray) -> 
     return Corrected(inner, tuple(solver.corrections), area_0, length_0)
 
 
-def simulate(
-    scene: Scene, output: str | Path | None = None, *, resume: bool = False, force: bool = False, progress: bool = False
-) -> Run:
+def simulate(scene: Scene, output: str | Path | None = None, *, resume: bool = False, force: bool = False, progress: bool = False) -> Run:
     """Runs a scene to its horizon; with `output`, into that HDF5 file, with checkpoints beside it.
 
     Raises ValueError for input that is wrong (before anything is touched), NumericalFailure for a rejected step (the last good state
@@ -91,7 +89,13 @@ def simulate(
         earlier = [_frame(problem, start.step, start.state, {})]
     if path is not None:
         _check_space(problem, path)
-    attributes = {"schema": SCHEMA, "scene": resolved, "solver": scene.solver.kind, "commit": _commit(), "seed": scene.vesicles.seed}
+    attributes = {
+        "schema": SCHEMA,
+        "scene": resolved,
+        "solver": scene.solver.kind,
+        "commit": _commit(),
+        "seed": scene.vesicles.seed,
+    }
     attributes |= {"t_gamma": problem.flow.time_scale or 0.0, "flow_width": problem.flow.width or 0.0}
     writer = None if path is None else TrajectoryWriter(path, attributes, earlier)
     if path is not None and not resume:

@@ -109,7 +109,9 @@ def _shapes(v: Vesicles, single: np.ndarray, count: int) -> np.ndarray:
 def _count_and_box(v: Vesicles, one: float) -> tuple[int, tuple[float, float]]:
     given = [name for name in ("count", "area_fraction", "box") if getattr(v, name) is not None]
     if len(given) != 2:
-        raise ValueError(f"vesicles: placement = \"{v.placement}\" needs two of count, area_fraction and box, got {' and '.join(given) or 'none'}")
+        raise ValueError(
+            f'vesicles: placement = "{v.placement}" needs two of count, area_fraction and box, got {" and ".join(given) or "none"}'
+        )
     if v.box is None:
         assert v.count is not None
         assert v.area_fraction is not None
@@ -172,7 +174,9 @@ def _check_membranes(X: np.ndarray) -> None:
     nu = reduced_area(X)
     bad = np.flatnonzero(~((nu > 0) & (nu <= 1 + 1e-9)))
     if len(bad):
-        raise ValueError(f"vesicle {bad[0]} has reduced area {nu[bad[0]]:.6g}: expected a value in (0, 1]; its nodes do not resolve a curve")
+        raise ValueError(
+            f"vesicle {bad[0]} has reduced area {nu[bad[0]]:.6g}: expected a value in (0, 1]; its nodes do not resolve a curve"
+        )
 
 
 def _check_rotation(X: np.ndarray) -> None:
@@ -197,7 +201,7 @@ def _flow(scene: Scene, radius: float) -> BackgroundFlow:
     if f.width is not None and f.confinement is not None:
         raise ValueError("flow.width and flow.confinement both set the width: keep one")
     if f.u_max is not None and f.kind not in ("poiseuille", "taylor_green"):
-        raise ValueError(f'flow.u_max goes with poiseuille and taylor_green; give {f.kind} a rate or a capillary number')
+        raise ValueError(f"flow.u_max goes with poiseuille and taylor_green; give {f.kind} a rate or a capillary number")
     width = radius / f.confinement if f.confinement else f.width
     rate = f.rate
     if f.capillary is not None:

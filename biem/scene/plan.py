@@ -35,7 +35,11 @@ def required_parts(problem: Problem) -> list[Part]:
     return [
         Part("relaxation", True, "bending is implicit: one dense solve a vesicle"),
         Part("background flow", flowing, f"flow {problem.flow.kind}" if flowing else "the fluid is at rest"),
-        Part("tension", many or output.tension, "its force moves the other vesicles" if many else "asked for" if output.tension else "not asked for"),
+        Part(
+            "tension",
+            many or output.tension,
+            "its force moves the other vesicles" if many else "asked for" if output.tension else "not asked for",
+        ),
         Part("vesicle-vesicle coupling", many, f"{M} vesicles: GMRES over pair sums" if many else "one vesicle"),
         near,
         Part("area and length correction", "area_length" in solver.corrections, "solver.corrections"),

@@ -20,14 +20,14 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from biem.backend import Array, constant, count, from_numpy, one_blas_thread, parallel_map, to_numpy
 from biem.curves.curve import arclength_weights
-from biem.curves.fourier import resample, resampling_matrix
+from biem.curves.fourier import read_back, read_back_matrix, remove_nyquist, resample, resampling_matrix
 from biem.errors import NumericalFailure
 from biem.membrane.maps import operator_points, relaxation_system
 from biem.membrane.operators import VesicleOperators, bending_force, membrane_force
 from biem.steppers.stepper import Flow, State, StepResult
 from biem.stokes.farfield_direct import direct_sum
 from biem.stokes.near import apply_rows, near_correction, near_width
-from biem.stokes.near_search import find_near
+from biem.stokes.near_search import NearPairs, find_near
 from biem.stokes.single_layer import near_scheme
 
 CHUNK_VALUES = 1 << 15  # matrix entries per operator of one chunk of vesicles: they stay in the cache
@@ -65,7 +65,7 @@ class ImplicitStepper:
         rhs = u_inf + coupling.velocity(response.force_0)
         guess = rhs if state.sigma is None else u_inf + coupling.velocity(membrane_force(X, state.sigma, self.kappa_b))
         u, iterations = self._gmres(lambda v: v - coupling.velocity(response.force(v)), rhs, guess, coupling)
-        new = State(state.t + dt, X + response.increment(u), response.tension(u))
+        new = State(state.t + dt, X + remove_nyquist(response.increment(u)), response.tension(u))
         return StepResult(new, {"gmres_iterations": iterations})
 
     def _step_alone(self, state: State, dt: float) -> StepResult:
@@ -78,8 +78,9 @@ class ImplicitStepper:
             velocity = velocity + resample(self.flow(state.X, state.t), ops.X.shape[-1])
         columns = xp.reshape(velocity, (1, -1, 1))
         increment, tension = relaxation_system(ops, columns, dt, self.tension)
-        sigma = None if tension is None else resample(tension[..., 0], N)
-        return StepResult(State(state.t + dt, state.X + resample(xp.reshape(increment, ops.X.shape), N), sigma), {"gmres_iterations": 0})
+        sigma = None if tension is None else read_back(tension[..., 0], N)
+        X = state.X + remove_nyquist(read_back(xp.reshape(increment, ops.X.shape), N))
+        return StepResult(State(state.t + dt, X, sigma), {"gmres_iterations": 0})
 
     def _operators(self, X: Array) -> VesicleOperators:
         return VesicleOperators(resample(X, operator_points(X.shape[-1], self.points)), self.kappa_b, self.mu)
@@ -108,16 +109,21 @@ class ImplicitStepper:
         increment, tension = relaxation_system(ops, columns, dt, True)
         D, D4 = ops.D, ops.D4
         x_s, y_s = ops.tangent[:, 0, :, None], ops.tangent[:, 1, :, None]
-        R = constant(resampling_matrix, N, n, like=X)
+        R = constant(read_back_matrix, N, n, like=X)
         R_bend, R_tension = -self.kappa_b * xp.matmul(R, D4), xp.matmul(R, D)
         fx = xp.matmul(R_bend, increment[:, :n]) + xp.matmul(R_tension, x_s * tension)
         fy = xp.matmul(R_bend, increment[:, n:]) + xp.matmul(R_tension, y_s * tension)
         force = xp.concat([fx, fy], axis=1)
         increment = xp.concat([xp.matmul(R, increment[:, :n]), xp.matmul(R, increment[:, n:])], axis=1)
         tension = xp.matmul(R, tension)
-        force_0 = xp.reshape(force[..., 0], (m, 2, N)) + resample(bending_force(ops.X, self.kappa_b), N)
+        force_0 = xp.reshape(force[..., 0], (m, 2, N)) + read_back(bending_force(ops.X, self.kappa_b), N)
         return Response(
-            xp.reshape(increment[..., 0], (m, 2, N)), increment[..., 1:], tension[..., 0], tension[..., 1:], force_0, force[..., 1:]
+            xp.reshape(increment[..., 0], (m, 2, N)),
+            increment[..., 1:],
+            tension[..., 0],
+            tension[..., 1:],
+            force_0,
+            force[..., 1:],
         )
 
     def _gmres(self, apply, rhs: Array, guess: Array, coupling: Coupling) -> tuple[Array, int]:  # type: ignore[no-untyped-def]
@@ -191,7 +197,7 @@ class Coupling:
     weights: Array
     targets: Array
     owner: Array
-    pairs: object
+    pairs: NearPairs | None
     rows: Array | None
     gap: float
 
@@ -215,6 +221,6 @@ class Coupling:
         xp = array_namespace(f)
         M, _, N = f.shape
         u = direct_sum(self.targets, self.X, f * self.weights, self.mu, self.owner)
-        if self.rows is not None:
+        if self.rows is not None and self.pairs is not None:
             u = apply_rows(u, self.rows, self.pairs, f)
         return xp.permute_dims(xp.reshape(u, (M, N, 2)), (0, 2, 1))

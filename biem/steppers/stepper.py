@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -32,7 +32,4 @@ class Stepper(Protocol):
     def step(self, state: State, dt: float) -> StepResult: ...
 
 
-class Flow(Protocol):
-    """Background velocity (M, 2, N) at X (M, 2, N) and time t."""
-
-    def __call__(self, X: Array, t: float) -> Array: ...
+Flow = Callable[[Array, float], Array]  # background velocity (M, 2, N) at X (M, 2, N) and time t

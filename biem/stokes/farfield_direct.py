@@ -29,7 +29,9 @@ def direct_sum(targets: Array, X: Array, weighted_force: Array, mu: float, exclu
     x, y = targets - origin, X - origin[None, :, None]
     skip = xp.full((targets.shape[0],), -1, dtype=xp.int64, device=X.device) if exclude is None else exclude
     if is_numpy_array(X) and X.dtype == np.float64:
-        return _compiled()(np.ascontiguousarray(x), np.ascontiguousarray(y), np.ascontiguousarray(weighted_force), skip, stokeslet_prefactor(mu))
+        return _compiled()(
+            np.ascontiguousarray(x), np.ascontiguousarray(y), np.ascontiguousarray(weighted_force), skip, stokeslet_prefactor(mu)
+        )
     return _chunked(x, y, weighted_force, skip, mu)
 
 

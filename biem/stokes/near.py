@@ -66,9 +66,7 @@ def accurate_rows(X: Array, points: Array, pairs: NearPairs, mu: float, scheme: 
         here = todo & ((level - 0.25) * N * pairs.rho >= digits)
         if here.any():
             index = np.flatnonzero(here)
-            rows[from_numpy(index, like=X)] = _trapezoid_rows(
-                X, points[from_numpy(index, like=X)], pairs.vesicle[index], level * N, mu
-            )
+            rows[from_numpy(index, like=X)] = _trapezoid_rows(X, points[from_numpy(index, like=X)], pairs.vesicle[index], level * N, mu)
         todo &= ~here
     if todo.any():
         index = np.flatnonzero(todo)

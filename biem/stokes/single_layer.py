@@ -30,7 +30,8 @@ def single_layer(
         raise ValueError(f'far_field = "{far_field}": expected "auto" or "direct"')
     if X.ndim != 3 or X.shape[1] != 2 or f.shape != X.shape or targets.ndim != 2 or targets.shape[1] != 2:
         raise ValueError(
-            f"single_layer got X {tuple(X.shape)}, f {tuple(f.shape)}, targets {tuple(targets.shape)}: expected X and f (M, 2, N), targets (P, 2)"
+            f"single_layer got X {tuple(X.shape)}, f {tuple(f.shape)}, targets {tuple(targets.shape)}: "
+            "expected X and f (M, 2, N), targets (P, 2)"
         )
     u = direct_sum(targets, X, f * arclength_weights(X)[:, None, :], mu, exclude)
     if scheme == "none":
