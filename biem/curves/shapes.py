@@ -17,7 +17,6 @@ from biem.curves.reparam import redistribute
 
 FINE = 1024  # nodes on which shapes are made before they are resampled
 EQUILIBRIUM_MODES = 40
-PERTURBED_MODES = 6
 
 
 def ellipse(points: int, reduced_area: float, perimeter: float = 1.0) -> np.ndarray:
@@ -45,16 +44,25 @@ def equilibrium(points: int, reduced_area: float, perimeter: float = 1.0) -> np.
     return _finish(X, points, perimeter)
 
 
-def perturbed(points: int, reduced_area: float, perimeter: float = 1.0, seed: int | np.random.Generator = 0) -> np.ndarray:
-    """Random smooth shape: tangent angle with modes 2..6 of random amplitudes, scaled to the reduced area; no self-crossing."""
+def perturbed(
+    points: int,
+    reduced_area: float,
+    perimeter: float = 1.0,
+    seed: int | np.random.Generator = 0,
+    modes: int = 6,
+    power: float = 1.5,
+) -> np.ndarray:
+    """Random smooth shape without self-crossing: tangent angle with modes k = 2..modes of normal amplitudes / k^power.
+
+    The amplitudes are scaled together to the reduced area. Raises ValueError where 200 draws all cross themselves.
+    """
     _check(points, reduced_area)
     rng = np.random.default_rng(seed)
     if reduced_area == 1:
         return ellipse(points, 1.0, perimeter)
     for _ in range(200):
-        modes = np.arange(2, PERTURBED_MODES + 1)
-        amplitude = rng.normal(size=(2, len(modes))) / modes**1.5
-        X = _perturbed_curve(modes, amplitude, reduced_area)
+        k = np.arange(2, modes + 1)
+        X = _perturbed_curve(k, rng.normal(size=(2, len(k))) / k**power, reduced_area)
         if X is not None and not self_crossings(resample(X, 256)[None]):
             return _finish(X, points, perimeter)
     raise ValueError(f"no perturbed shape of reduced area {reduced_area} without self-crossing was found: choose a larger one")

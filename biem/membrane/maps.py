@@ -1,7 +1,7 @@
 """The seam between steppers and membrane physics: `MembraneMaps`, and its exact realisation by dense operators.
 
 All maps are batched over M vesicles in the world frame. `ExactMaps` builds its operators on `points` nodes of the resampled curve
-and reads the result back on the N nodes it was given; 2 N removes the aliasing of P and T that dominates at small N.
+and reads velocities and tensions back on the N nodes it was given; 2 N removes the aliasing of P and T that dominates at small N.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from array_api_compat import array_namespace
 
 from biem.backend import Array, count, solve
 from biem.curves.curve import length, normal
-from biem.curves.fourier import read_back, remove_nyquist, resample
+from biem.curves.fourier import read_back, resample
 from biem.membrane.operators import VesicleOperators
 from biem.stokes.near import layer_values
 
@@ -76,7 +76,9 @@ class ExactMaps:
         ops = self.operators(X)
         M, _, n = ops.X.shape
         increment, _ = relaxation_system(ops, xp.reshape(ops.bending_velocity(), (M, 2 * n, 1)), dt, False)
-        return X + remove_nyquist(read_back(xp.reshape(increment, (M, 2, n)), X.shape[-1]))
+        # low-passed, not read back at the nodes: the stiff modes that N nodes cannot hold relax at once, whatever dt is, and would
+        # alias into the shape at every step
+        return X + resample(xp.reshape(increment, (M, 2, n)), X.shape[-1])
 
     def self_tension(self, X: Array) -> Array:
         ops = self.operators(X)

@@ -29,6 +29,7 @@ from biem.scene.config import Scene
 from biem.scene.plan import trajectory_bytes
 from biem.steppers.corrections import Corrected
 from biem.steppers.implicit import ImplicitStepper
+from biem.steppers.order import Extrapolated
 from biem.steppers.stepper import State, Stepper
 from biem.stokes.near_search import minimum_gap
 
@@ -51,7 +52,7 @@ class Run:
 def make_stepper(problem: Problem, area_0: np.ndarray, length_0: np.ndarray) -> Stepper:
     """The stepper that the scene asks for, with its corrections."""
     scene, solver = problem.scene, problem.scene.solver
-    inner = ImplicitStepper(
+    inner: Stepper = ImplicitStepper(
         scene.physics.kappa_b,
         scene.physics.mu,
         None if problem.flow.kind == "quiescent" else problem.flow.velocity,
@@ -62,6 +63,8 @@ def make_stepper(problem: Problem, area_0: np.ndarray, length_0: np.ndarray) -> 
         solver.near_tolerance,
         scene.output.tension,
     )
+    if scene.time.order == 2:
+        inner = Extrapolated(inner)
     return Corrected(inner, tuple(solver.corrections), area_0, length_0)
 
 

@@ -64,6 +64,7 @@ class Time(Table):
     dt: float | str
     horizon: float | str
     save_every: int = Field(1, ge=1)
+    order: Literal[1, 2] = 1  # 2: each step against two half steps, locally extrapolated; three times the work
 
 
 class Solver(Table):
@@ -122,7 +123,7 @@ def make_scene(table: dict[str, Any], folder: str | Path = ".") -> Scene:
     try:
         return Scene.model_validate({**table, "folder": Path(folder)})
     except ValidationError as error:
-        raise ValueError("; ".join(_explain(e) for e in error.errors())) from None
+        raise ValueError("; ".join(dict.fromkeys(_explain(e) for e in error.errors()))) from None
 
 
 def time_value(value: float | str, key: str, units: dict[str, float | None]) -> float:
@@ -176,4 +177,9 @@ def _explain(error: Any) -> str:
         return f"unknown key {path}: {hint}"
     if error["type"] == "missing":
         return f"key {path} is missing"
+    if error["type"] == "model_type":
+        return f"{path} = {error['input']!r}: expected a table [{path}]"
+    if path.startswith(("time.dt.", "time.horizon.")):  # one line for the two types that a time may have
+        path = path.rpartition(".")[0]
+        return f'{path} = {error["input"]!r}: expected a positive, finite number or a number and a unit, as in "0.01 t_gamma"'
     return f"{path} = {error['input']!r}: {error['msg'][0].lower()}{error['msg'][1:]}"

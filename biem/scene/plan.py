@@ -44,6 +44,7 @@ def required_parts(problem: Problem) -> list[Part]:
         near,
         Part("area and length correction", "area_length" in solver.corrections, "solver.corrections"),
         Part("redistribution of nodes", "redistribute" in solver.corrections, "solver.corrections"),
+        Part("extrapolation", problem.scene.time.order == 2, f"time.order = {problem.scene.time.order}"),
         Part("walls", False, "none in the scene"),
     ]
 

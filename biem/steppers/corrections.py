@@ -22,7 +22,7 @@ CORRECTIONS = (REDISTRIBUTE, AREA_LENGTH)
 
 @dataclass(frozen=True)
 class Corrected:
-    """`inner`, then area and length restored to area_0, length_0 (M,), then nodes redistributed to equal arclength."""
+    """`inner`, then nodes redistributed to equal arclength, then area and length restored to area_0, length_0 (M,)."""
 
     inner: Stepper
     corrections: tuple[str, ...]
@@ -40,11 +40,11 @@ class Corrected:
             diagnostics[f"{name}_error_vesicle"] = worst
         if not bool(xp.all(xp.isfinite(X))):
             return StepResult(result.state, diagnostics)  # nothing to correct: the guard rejects it
-        if AREA_LENGTH in self.corrections:
-            X, restored = restore_area_length(X, self.area_0, self.length_0)
-            count("area_length_restored", restored)
         if REDISTRIBUTE in self.corrections:
             X, *fields = redistribute(X, *([] if sigma is None else [sigma]))
             sigma = fields[0] if fields else None
             count("redistributed", X.shape[0])
+        if AREA_LENGTH in self.corrections:
+            X, restored = restore_area_length(X, self.area_0, self.length_0)
+            count("area_length_restored", restored)
         return StepResult(replace(result.state, X=X, sigma=sigma), diagnostics)

@@ -20,7 +20,7 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from biem.backend import Array, constant, count, from_numpy, one_blas_thread, parallel_map, to_numpy
 from biem.curves.curve import arclength_weights
-from biem.curves.fourier import read_back, read_back_matrix, remove_nyquist, resample, resampling_matrix
+from biem.curves.fourier import read_back, read_back_matrix, resample, resampling_matrix
 from biem.errors import NumericalFailure
 from biem.membrane.maps import operator_points, relaxation_system
 from biem.membrane.operators import VesicleOperators, bending_force, membrane_force
@@ -65,7 +65,7 @@ class ImplicitStepper:
         rhs = u_inf + coupling.velocity(response.force_0)
         guess = rhs if state.sigma is None else u_inf + coupling.velocity(membrane_force(X, state.sigma, self.kappa_b))
         u, iterations = self._gmres(lambda v: v - coupling.velocity(response.force(v)), rhs, guess, coupling)
-        new = State(state.t + dt, X + remove_nyquist(response.increment(u)), response.tension(u))
+        new = State(state.t + dt, X + response.increment(u), response.tension(u))
         return StepResult(new, {"gmres_iterations": iterations})
 
     def _step_alone(self, state: State, dt: float) -> StepResult:
@@ -79,7 +79,7 @@ class ImplicitStepper:
         columns = xp.reshape(velocity, (1, -1, 1))
         increment, tension = relaxation_system(ops, columns, dt, self.tension)
         sigma = None if tension is None else read_back(tension[..., 0], N)
-        X = state.X + remove_nyquist(read_back(xp.reshape(increment, ops.X.shape), N))
+        X = state.X + resample(xp.reshape(increment, ops.X.shape), N)
         return StepResult(State(state.t + dt, X, sigma), {"gmres_iterations": 0})
 
     def _operators(self, X: Array) -> VesicleOperators:
@@ -114,7 +114,8 @@ class ImplicitStepper:
         fx = xp.matmul(R_bend, increment[:, :n]) + xp.matmul(R_tension, x_s * tension)
         fy = xp.matmul(R_bend, increment[:, n:]) + xp.matmul(R_tension, y_s * tension)
         force = xp.concat([fx, fy], axis=1)
-        increment = xp.concat([xp.matmul(R, increment[:, :n]), xp.matmul(R, increment[:, n:])], axis=1)
+        low_pass = constant(resampling_matrix, N, n, like=X)  # see ExactMaps.relax
+        increment = xp.concat([xp.matmul(low_pass, increment[:, :n]), xp.matmul(low_pass, increment[:, n:])], axis=1)
         tension = xp.matmul(R, tension)
         force_0 = xp.reshape(force[..., 0], (m, 2, N)) + read_back(bending_force(ops.X, self.kappa_b), N)
         return Response(

@@ -115,7 +115,8 @@ def _trapezoid_rows(X: Array, points: Array, vesicle: np.ndarray, n: int, mu: fl
 def _graded_rows(X: Array, points: Array, pairs: NearPairs, mu: float) -> Array:
     """Gauss-Legendre panels about each pair's closest point, halved towards it down to the pair's distance (Q, 3, N).
 
-    The curve is shifted so that the closest point is at parameter 0: one set of panels serves a whole chunk.
+    The curve is shifted so that the closest point is at parameter 0: one set of panels serves a whole chunk. Shifts are made on 2 N
+    nodes, where the Nyquist mode of the N nodes is one like any other.
     """
     xp = array_namespace(X)
     N = X.shape[-1]
@@ -130,14 +131,14 @@ def _graded_rows(X: Array, points: Array, pairs: NearPairs, mu: float) -> Array:
         alpha = from_numpy(pairs.alpha[chunk], like=X)
         curve = X[from_numpy(pairs.vesicle[chunk], like=X)]
         origin = center_of_nodes(curve)
-        curve = shift(curve - origin, alpha[:, None])
+        curve = shift(resample(curve - origin, 2 * N), alpha[:, None])
         at = xp.matmul(curve, E.T)
         tangent = xp.matmul(curve, constant(_panel_derivative, N, finest, like=X).T)
         weight = w * xp.sqrt(tangent[:, 0] ** 2 + tangent[:, 1] ** 2)
         x = points[chunk][:, :, None] - origin
         G = stokeslet(x[:, 0] - at[:, 0], x[:, 1] - at[:, 1], mu)
         rows = xp.matmul(xp.stack([weight * g for g in G], axis=1), E)
-        parts.append(shift(rows, -alpha[:, None]))
+        parts.append(xp.matmul(shift(rows, -alpha[:, None]), constant(resampling_matrix, 2 * N, N, like=X)))
     return xp.concat(parts, axis=0)
 
 
@@ -216,11 +217,11 @@ def _panel_weights(N: int, finest: int) -> np.ndarray:
 
 
 def _panel_interpolation(N: int, finest: int) -> np.ndarray:
-    return interpolation_matrix(_panel_nodes(N, finest), N)
+    return interpolation_matrix(_panel_nodes(N, finest), 2 * N)
 
 
 def _panel_derivative(N: int, finest: int) -> np.ndarray:
-    c = coefficients(np.eye(N))[None]
+    c = coefficients(np.eye(2 * N))[None]
     return np.ascontiguousarray(evaluate(c, _panel_nodes(N, finest)[None, :], 1)[0].T)
 
 

@@ -1,0 +1,41 @@
+"""Values known from independent computations: steady shear, equilibrium energy, the encounter of two vesicles."""
+
+import numpy as np
+import pytest
+
+from biem.curves.curve import area, bending_energy, effective_radius, inclination, length
+from biem.curves.shapes import ellipse, perturbed
+from biem.steppers.corrections import CORRECTIONS, Corrected
+from biem.steppers.implicit import ImplicitStepper
+from biem.steppers.stepper import State
+
+
+@pytest.mark.parametrize(("capillary", "angle"), [(1.0, 0.35307), (10.0, 0.35700)])
+def test_steady_inclination_in_shear(capillary, angle):
+    """Steady angle to 1e-3 at dt = 0.01 t_gamma, to 1e-4 after one Richardson step (0.02, 0.01), N = 32."""
+    X = ellipse(32, 0.65)[None]
+    rate = capillary / float(effective_radius(X)[0]) ** 3
+
+    def steady(h):
+        inner = ImplicitStepper(1.0, 1.0, lambda Y, t: np.stack([rate * Y[:, 1], 0 * Y[:, 1]], axis=1))
+        stepper, state = Corrected(inner, CORRECTIONS, area(X), length(X)), State(0.0, X)
+        for _ in range(round(16 / h)):
+            state = stepper.step(state, h / rate).state
+        return float(inclination(state.X)[0])
+
+    coarse, fine = steady(0.02), steady(0.01)
+    assert fine == pytest.approx(angle, abs=1e-3)
+    assert 2 * fine - coarse == pytest.approx(angle, abs=2e-4)
+
+
+def test_relaxation_reaches_the_equilibrium_energy():
+    X = perturbed(64, 0.65, seed=0)[None]
+    stepper, state = Corrected(ImplicitStepper(1.0, 1.0), CORRECTIONS, area(X), length(X)), State(0.0, X)
+    energies = [float(bending_energy(X)[0])]
+    for dt, steps in ((1e-5, 100), (2e-4, 400)):
+        for _ in range(steps):
+            state = stepper.step(state, dt).state
+            energies.append(float(bending_energy(state.X)[0]))
+    assert energies[-1] == pytest.approx(42.8572, abs=1e-4)
+    assert max(np.diff(energies)) < 1e-7
+    assert energies[0] > 60.0

@@ -1,0 +1,159 @@
+"""Scene files: every key is validated; a refusal is one line that names the key by its path and says what to do."""
+
+import json
+import re
+from typing import get_args
+
+import pytest
+from pydantic import BaseModel
+from scene_helpers import scene_of, write_scene
+
+from biem.scene.build import build
+from biem.scene.config import Scene, load_scene, make_scene
+
+# For every key of the schema, values that must be refused with the key in the message.
+REFUSED = {
+    "name": '"two words" | "" | 3',
+    "physics.kappa_b": '0 | -1.0 | nan | "stiff" | true',
+    "physics.mu": "0.0 | inf | [1.0]",
+    "vesicles.file": '3 | "missing.h5"',
+    "vesicles.placement": '"heap"',
+    "vesicles.shape": '"star"',
+    "vesicles.reduced_area": "0 | 1.0001 | -0.5 | nan",
+    "vesicles.points": '17 | 14 | 0 | -32 | 32.5 | "32" | true',
+    "vesicles.length": "0 | inf",
+    "vesicles.seed": "-1 | 0.5",
+    "vesicles.centers": "[] | [[0.0, nan]] | [[0.0, 0.0, 0.0]] | [0.0, 0.0]",
+    "vesicles.angles": "[inf] | [0.0, 1.0]",
+    "vesicles.unit": '"mm"',
+    "vesicles.count": "0 | 1.5",
+    "vesicles.area_fraction": "0 | 1.0 | nan",
+    "vesicles.box": "[1.0] | [1.0, inf]",
+    "vesicles.corner": "[0.0]",
+    "vesicles.gap": "-0.1 | nan",
+    "flow.kind": '"sheer"',
+    "flow.rate": '"fast" | nan',
+    "flow.u_max": "inf",
+    "flow.capillary": "nan",
+    "flow.width": "0 | -1",
+    "flow.confinement": "0 | inf",
+    "flow.function": "3",
+    "time.dt": '0 | -1e-4 | nan | inf | true | [1] | "0.01 furlongs" | "t_gamma" | "1 2 t_gamma" | "" | "-1 t_gamma" | "nan"',
+    "time.horizon": '0 | -1.0 | "inf t_kappa" | inf',
+    "time.save_every": "0 | 2.5",
+    "time.order": "0 | 3 | true",
+    "solver.kind": '"exact"',
+    "solver.tolerance": "0 | 1",
+    "solver.max_iterations": "0",
+    "solver.operator_points": "8 | 33",
+    "solver.near_field": '"far"',
+    "solver.near_tolerance": "-1e-8 | nan",
+    "solver.corrections": '["areas"] | "area_length"',
+    "solver.max_error": "0 | nan",
+    "output.trajectory": "5",
+    "output.checkpoint_every": "0",
+    "output.tension": "3",
+}
+
+
+def schema(model=Scene, prefix=""):
+    """All keys of a scene file by their paths."""
+    for name, field in model.model_fields.items():
+        inner = [a for a in (field.annotation, *get_args(field.annotation)) if isinstance(a, type) and issubclass(a, BaseModel)]
+        if inner:
+            yield from schema(inner[0], f"{prefix}{name}.")
+        elif name != "folder":
+            yield prefix + name
+
+
+def refusal(path, *overrides):
+    with pytest.raises(ValueError) as caught:
+        build(load_scene(path, overrides))
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in REFUSED.items() for value in values.split(" | ")])
+def test_bad_value_is_refused_with_its_key(tmp_path, key, value):
+    assert key in refusal(write_scene(tmp_path), f"{key}={value}")
+
+
+def test_every_key_of_the_schema_has_bad_values_above():
+    assert set(schema()) == set(REFUSED)
+
+
+@pytest.mark.parametrize("key", sorted(schema()))
+def test_misspelt_key_names_its_path_and_the_nearest_key(tmp_path, key):
+    wrong = key + key[-1]
+    message = refusal(write_scene(tmp_path), f"{wrong}=1")
+    hint = message.partition(f"unknown key {wrong}: ")[2]
+    assert re.search(rf"did you mean {key.split('.')[-1]}\?", hint), message
+
+
+def test_unknown_tables_and_keys_far_from_any_name(tmp_path):
+    path = write_scene(tmp_path)
+    assert "did you mean vesicles?" in refusal(path, "vesicle.points=16")
+    assert "kappa_b, mu" in refusal(path, "physics.zzz=1")  # no name is near: the valid ones are listed
+    assert "unknown key folder" in refusal(path, 'folder="elsewhere"')  # what the loader knows is not a key of the file
+
+
+@pytest.mark.parametrize("missing", ["time.dt", "time.horizon"])
+def test_missing_key_is_named(missing):
+    with pytest.raises(ValueError, match=rf"key {missing} is missing"):
+        scene_of(time={missing.split(".")[1]: None})
+
+
+def test_missing_table_is_named():
+    with pytest.raises(ValueError, match=r"time.* missing"):
+        make_scene({"name": "no_time"})
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "fragment"),
+    [
+        ("missing.toml", None, "does not exist"),
+        ("folder.toml", "folder", "is a folder"),
+        ("bad.toml", b"[time]\ndt = = 1\n", "line 2"),
+        ("twice.toml", b"[time]\ndt = 1\ndt = 2\n", "not valid TOML"),
+        ("latin.toml", b'name = "caf\xe9"\n', "not valid TOML"),
+        ("empty.toml", b"", "time"),
+    ],
+)
+def test_a_file_that_is_no_scene(tmp_path, name, content, fragment):
+    path = tmp_path / name
+    if content == "folder":
+        path.mkdir()
+    elif content is not None:
+        path.write_bytes(content)
+    message = refusal(path)
+    assert fragment in message
+    assert name in message or content == b""
+
+
+@pytest.mark.parametrize("override", ["vesicles.points", "=32", " ", "name.first=1", "time.dt.unit=1"])
+def test_set_without_key_or_value_is_refused(tmp_path, override):
+    assert f"--set {override}" in refusal(write_scene(tmp_path), override)
+
+
+def test_overrides_take_numbers_lists_strings_and_times(tmp_path):
+    path = write_scene(tmp_path)
+    numbers = ["vesicles.points=32", "vesicles.points=48", "vesicles.centers=[[1, 2.5]]"]
+    scene = load_scene(path, [*numbers, "flow.kind=extensional", "time.dt=0.01 t_gamma", "output.tension=true"])
+    assert (scene.vesicles.points, scene.vesicles.centers, scene.flow.kind) == (48, [(1.0, 2.5)], "extensional")
+    assert (scene.time.dt, scene.output.tension) == ("0.01 t_gamma", True)
+    assert load_scene(path).vesicles.points == 16
+
+
+def test_name_is_the_files_unless_given(tmp_path):
+    path = tmp_path / "my_scene.toml"
+    path.write_text("[time]\ndt = 1\nhorizon = 2\n")
+    assert load_scene(path).name == "my_scene"
+    assert load_scene(path, ["name=other"]).name == "other"
+
+
+def test_resolved_scene_is_a_scene_again():
+    scene = scene_of(time={"dt": "0.01 t_gamma"}, solver={"corrections": []})
+    again = make_scene(json.loads(json.dumps(scene.model_dump(mode="json"))), scene.folder)
+    assert again == scene
+    assert (build(again).X == build(scene).X).all()

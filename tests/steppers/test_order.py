@@ -1,0 +1,69 @@
+"""Extrapolated steps: second order, an estimate of the right size, the same state for steady states."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from biem.curves.curve import effective_radius
+from biem.curves.shapes import equilibrium, place
+from biem.steppers.implicit import ImplicitStepper
+from biem.steppers.order import Extrapolated
+from biem.steppers.stepper import State, StepResult
+
+
+def pair(points=32):
+    one = equilibrium(points, 0.65)
+    R = float(effective_radius(one[None])[0])
+    return np.stack([place(one, np.array([-2.3 * R, 0.3 * R]), 0.0), place(one, np.zeros(2), np.pi / 2)])
+
+
+def in_shear(X, capillary=5.0):
+    rate = capillary / float(effective_radius(X)[0]) ** 3
+    return ImplicitStepper(1.0, 1.0, lambda Y, t: np.stack([rate * Y[:, 1], 0.0 * Y[:, 1]], axis=1)), 1.0 / rate
+
+
+def test_second_order_for_the_coupled_pair():
+    """Once the stiff modes have settled on the flow (they reduce the order for a while)."""
+    X = pair(48)
+    inner, t_gamma = in_shear(X)
+    settled = State(0.0, X)
+    for _ in range(20):
+        settled = inner.step(settled, 0.02 * t_gamma).state
+    ends = []
+    for h in (0.02, 0.01, 0.005):
+        state = settled
+        for _ in range(round(0.12 / h)):
+            state = Extrapolated(inner).step(state, h * t_gamma).state
+        ends.append(state.X)
+    order = np.log2(np.abs(ends[0] - ends[1]).max() / np.abs(ends[1] - ends[2]).max())
+    assert order == pytest.approx(2.0, abs=0.1)
+
+
+def test_estimate_is_the_error_of_two_half_steps():
+    X = pair()
+    inner, t_gamma = in_shear(X)
+    dt = 0.02 * t_gamma
+    result = Extrapolated(inner).step(State(0.0, X), dt)
+    state = State(0.0, X)
+    for _ in range(64):
+        state = inner.step(state, dt / 64).state
+    half = inner.step(inner.step(State(0.0, X), dt / 2).state, dt / 2).state
+    assert result.diagnostics["error_estimate"] == pytest.approx(np.abs(half.X - state.X).max(), rel=0.1)
+    assert np.abs(result.state.X - state.X).max() < 0.1 * result.diagnostics["error_estimate"]
+    assert result.diagnostics["gmres_iterations"] > 0
+
+
+def test_exact_for_a_linear_equation_of_second_degree():
+    """A first-order stepper for x' = t (explicit Euler) becomes exact: x = t^2 / 2."""
+
+    class Euler:
+        def step(self, state, dt):
+            return StepResult(replace(state, t=state.t + dt, X=state.X + dt * state.t), {})
+
+    X = pair()
+    state = State(0.0, X)
+    for _ in range(4):
+        state = Extrapolated(Euler()).step(state, 0.25).state
+    assert np.abs(state.X - X - 0.5).max() < 1e-14
+    assert state.sigma is None
