@@ -26,7 +26,7 @@ def restore_area_length(X: Array, area_0: Array, length_0: Array) -> tuple[Array
     """
     xp = array_namespace(X)
     off = _errors(X, area_0, length_0)
-    wrong = xp.max(xp.abs(off), axis=-1) > TOLERANCE
+    wrong = ~(xp.max(xp.abs(off), axis=-1) <= TOLERANCE)  # true for NaN
     changed = int(xp.sum(xp.astype(wrong, xp.int64)))
     if changed == 0:
         return X, 0

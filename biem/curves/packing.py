@@ -11,6 +11,7 @@ from scipy import optimize
 from scipy.spatial import cKDTree
 
 from biem.curves.crossing import polygons
+from biem.curves.curve import area
 from biem.curves.shapes import place
 
 MOVES = 60  # accepted or not, of each vesicle
@@ -51,6 +52,12 @@ def random_packing(shapes: np.ndarray, box: tuple[float, float], gap: float, rng
     M = len(shapes)
     width = np.asarray(box, dtype=np.float64)
     radius = float(np.sqrt((shapes**2).sum(axis=1)).max())
+    one = float(np.mean(area(shapes)))
+    if M * one > width.prod():
+        raise ValueError(
+            f"{M} vesicles do not fit: they cover {M * one:.3g}, the box of {box[0]:g} x {box[1]:g} has {width.prod():.3g}: "
+            f"fewer than {int(width.prod() / one)} can fit"
+        )
     pitch = optimize.brentq(lambda c: np.prod(np.maximum(np.floor(width / c), 0)) - M + 0.5, 1e-9 * width.min(), 2 * width.max())
     pitch *= 1 - 1e-9
     per_row = np.floor(width / pitch).astype(int)

@@ -17,7 +17,7 @@ REFINEMENT = 2  # the speed has twice the modes of X and is sampled so
 
 
 def equal_arclength_parameters(X: Array) -> Array:
-    """alpha~ (M, N): parameters of N points equally spaced in arclength. Raises NumericalFailure where the speed vanishes."""
+    """alpha~ (M, N): parameters of N points equally spaced in arclength. Raises NumericalFailure where Newton fails."""
     xp = array_namespace(X)
     N = X.shape[-1]
     c = coefficients(speed(resample(X - center_of_nodes(X), REFINEMENT * N)))[:, None, :]

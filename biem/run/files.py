@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,15 +17,22 @@ def atomic_h5(path: Path) -> Iterator[h5py.File]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         try:
-            with h5py.File(temporary, "w") as file:
+            image = io.BytesIO()  # HDF5 that meets a full disk half way cannot even be closed
+            with h5py.File(image, "w") as file:
                 yield file
-        except RuntimeError as error:  # h5py reports a full disk at closing time so
-            raise OSError(f"{path} could not be written: {error}") from error
-        _sync(temporary)
-        os.replace(temporary, path)
-        _sync(path.parent)
+            temporary.write_bytes(image.getbuffer())
+            _sync(temporary)
+            os.replace(temporary, path)
+            _sync(path.parent)
+        except OSError as error:
+            raise OSError(f"{path} could not be written: {one_line(error)}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def one_line(error: Exception) -> str:
+    """The message of an error without its line breaks."""
+    return " ".join(str(error).split())
 
 
 def _sync(path: Path) -> None:

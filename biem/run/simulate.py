@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import FrameType
+from uuid import uuid4
 
 import numpy as np
 from tqdm import tqdm
@@ -21,7 +22,14 @@ from tqdm import tqdm
 from biem.backend import counting, fft_backend
 from biem.curves.curve import area, bending_energy, length
 from biem.errors import NumericalFailure
-from biem.run.checkpoint import Checkpoint, checkpoint_path, read_checkpoint, remove_checkpoints, write_checkpoint
+from biem.run.checkpoint import (
+    Checkpoint,
+    checkpoint_path,
+    prepare_checkpoint,
+    read_checkpoint,
+    remove_checkpoints,
+    write_checkpoint,
+)
 from biem.run.guard import check_state
 from biem.run.trajectory import SCHEMA, Trajectory, TrajectoryWriter, exists, join, one_frame, read_trajectory
 from biem.scene.build import Problem, build
@@ -82,14 +90,12 @@ def simulate(scene: Scene, output: str | Path | None = None, *, resume: bool = F
     resolved = json.dumps(scene.model_dump(mode="json"))
     if resume:
         assert path is not None
-        start = read_checkpoint(checkpoint_path(path))
-        _check_same_scene(start.scene, resolved)
+        start, earlier = _where_to_resume(path, resolved)
         problem = build(scene)
-        earlier = [read_trajectory(path).until(start.step)]
     else:
         problem = build(scene)
-        start = Checkpoint(0, State(0.0, problem.X), area(problem.X), length(problem.X), resolved)
-        earlier = [_frame(problem, start.step, start.state, {})]
+        start = Checkpoint(0, State(0.0, problem.X), area(problem.X), length(problem.X), resolved, run=uuid4().hex)
+        earlier = _frame(problem, start.step, start.state, {})
     if path is not None:
         _check_space(problem, path)
     attributes = {
@@ -98,30 +104,30 @@ def simulate(scene: Scene, output: str | Path | None = None, *, resume: bool = F
         "solver": scene.solver.kind,
         "commit": _commit(),
         "seed": scene.vesicles.seed,
+        "t_gamma": problem.flow.time_scale or 0.0,
+        "flow_width": problem.flow.width or 0.0,
+        "run": start.run,
     }
-    attributes |= {"t_gamma": problem.flow.time_scale or 0.0, "flow_width": problem.flow.width or 0.0}
-    writer = None if path is None else TrajectoryWriter(path, attributes, earlier)
-    if path is not None and not resume:
-        remove_checkpoints(checkpoint_path(path))  # of a run that --force replaces
-        write_checkpoint(checkpoint_path(path), start)
+    writer = None if path is None else _start_files(path, start, attributes, earlier, resume)
     with counting() as counts, fft_backend(problem.X.size):
         counts.update(start.counts)
-        loop = _Loop(problem, start, writer, counts, progress)
-        try:
-            loop.run()
-        finally:
-            if writer is not None:
-                writer.close()
+        loop = _Loop(problem, start, int(earlier.step[-1]), writer, counts, progress)
+        loop.run()
+        if writer is not None:
+            writer.close()
     if path is None:
-        return Run(join(earlier + loop.frames, attributes), None, counts)
+        return Run(join([earlier, *loop.frames], attributes), None, counts)
     return Run(read_trajectory(path), path, counts)
 
 
 class _Loop:
     """One run from a checkpoint to the horizon."""
 
-    def __init__(self, problem: Problem, start: Checkpoint, writer: TrajectoryWriter | None, counts: Counter[str], progress: bool):
+    def __init__(
+        self, problem: Problem, start: Checkpoint, saved: int, writer: TrajectoryWriter | None, counts: Counter[str], progress: bool
+    ) -> None:
         self.problem = problem
+        self.saved = saved  # step of the last frame
         self.start = start
         self.writer = writer
         self.counts = counts
@@ -132,20 +138,18 @@ class _Loop:
         self.state = start.state
         self.running = dict(start.running)
         self.latest: Mapping[str, float] = {}
+        self.shortened = False
 
     def run(self) -> None:
         scene = self.problem.scene
         every = scene.time.save_every
         checkpoint_every = scene.output.checkpoint_every or every
-        saved = self.step
         with _signals() as stop, self._bar() as bar:
             while self.step < self.problem.steps:
                 try:
                     self._advance()
                 except NumericalFailure as failure:
-                    if saved != self.step:
-                        self._save_frame()
-                    self._checkpoint()
+                    self._close_with_this_state()
                     unit = self.problem.flow.time_scale
                     when = f"t = {self.state.t:.6g}" + (f" ({self.state.t / unit:.4g} t_gamma)" if unit else "")
                     raise NumericalFailure(
@@ -154,19 +158,25 @@ class _Loop:
                 last = self.step == self.problem.steps
                 if self.step % every == 0 or last:
                     self._save_frame()
-                    saved = self.step
-                if self.step % checkpoint_every == 0 or last or stop():
+                stopping = stop() and not last
+                if (self.step % checkpoint_every == 0 or last or stopping) and not self.shortened:
                     self._checkpoint()
                 bar.update()
                 bar.set_postfix_str(self._status(), refresh=False)
-                if stop() and not last:
+                if stopping:
+                    if self.writer is not None:
+                        self.writer.close()
                     raise Stopped(f"stopped at step {self.step} of {self.problem.steps}")
 
     def _advance(self) -> None:
         problem = self.problem
         begin = time.perf_counter()
-        t_next = min((self.step + 1) * problem.dt, problem.horizon)
-        result = self.stepper.step(self.state, t_next - self.state.t)
+        t_next = (self.step + 1) * problem.dt
+        self.shortened = t_next > problem.horizon * (1 + 1e-9)  # the last step: not one to go on from
+        if self.shortened:
+            t_next = problem.horizon
+        with np.errstate(all="ignore"):  # what is not finite is the guard's to name
+            result = self.stepper.step(self.state, t_next - self.state.t if self.shortened else problem.dt)
         d = result.diagnostics
         check_state(result.state.X, result.state.sigma, d, problem.scene.solver.max_error)
         self.state = State(t_next, result.state.X, result.state.sigma)
@@ -185,11 +195,20 @@ class _Loop:
         else:
             self.writer.append(frame)
         self.running = {}
+        self.saved = self.step
+
+    def _close_with_this_state(self) -> None:
+        """The last good state as a frame and a checkpoint, all frames in one file."""
+        if self.saved != self.step:
+            self._save_frame()
+        self._checkpoint()
+        if self.writer is not None:
+            self.writer.close()
 
     def _checkpoint(self) -> None:
         if self.writer is not None:
             s = self.start
-            checkpoint = Checkpoint(self.step, self.state, s.area_0, s.length_0, s.scene, self.running, dict(self.counts))
+            checkpoint = Checkpoint(self.step, self.state, s.area_0, s.length_0, s.scene, self.running, dict(self.counts), s.run)
             write_checkpoint(checkpoint_path(self.writer.path), checkpoint)
 
     def _bar(self) -> tqdm:
@@ -238,10 +257,36 @@ def _signals() -> Iterator[Callable[[], bool]]:
             signal.signal(s, handler)
 
 
+def _where_to_resume(path: Path, scene: str) -> tuple[Checkpoint, Trajectory]:
+    """The checkpoint to go on from and the frames up to it."""
+    read_checkpoint(checkpoint_path(path))  # says so if there is none at all
+    frames = read_trajectory(path)
+    start = read_checkpoint(checkpoint_path(path), str(frames.attributes.get("run")))
+    _check_same_scene(start.scene, scene)
+    return start, frames.until(start.step)
+
+
+def _start_files(path: Path, start: Checkpoint, attributes: dict, earlier: Trajectory, resume: bool) -> TrajectoryWriter:
+    """Trajectory and checkpoint of a run that begins or goes on; what --force replaces is there until both could be written."""
+    path.absolute().parent.mkdir(parents=True, exist_ok=True)
+    if resume:
+        return TrajectoryWriter(path, attributes, [earlier])
+    checkpoint = checkpoint_path(path)
+    prepare_checkpoint(checkpoint, start)
+    try:
+        writer = TrajectoryWriter(path, attributes, [earlier])
+    except BaseException:
+        checkpoint.with_name(checkpoint.name + ".next").unlink(missing_ok=True)
+        raise
+    remove_checkpoints(checkpoint)
+    write_checkpoint(checkpoint, start)
+    return writer
+
+
 def _check_same_scene(old: str, new: str) -> None:
     """A run may be resumed with a longer horizon and other output settings; nothing else may differ."""
     a, b = _flat(json.loads(old)), _flat(json.loads(new))
-    free = ("time.horizon", "output.")
+    free = ("time.horizon", "output.trajectory", "output.checkpoint_every")
     differ = [k for k in sorted(a.keys() | b.keys()) if a.get(k) != b.get(k) and not k.startswith(free)]
     if differ:
         what = "; ".join(f"{k} was {a.get(k)!r}, is {b.get(k)!r}" for k in differ[:4])
@@ -260,7 +305,8 @@ def _flat(table: dict, prefix: str = "") -> dict[str, object]:
 
 def _check_space(problem: Problem, path: Path) -> None:
     folder = path.absolute().parent
-    folder.mkdir(parents=True, exist_ok=True)
+    while not folder.exists():
+        folder = folder.parent
     needed, free = 2.2 * trajectory_bytes(problem), shutil.disk_usage(folder).free  # merging holds two copies
     if needed > free:
         raise ValueError(

@@ -16,7 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from biem.run.files import atomic_h5
+from biem.run.files import atomic_h5, one_line
 
 SCHEMA = 1
 DIAGNOSTICS = ("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap")
@@ -74,27 +74,29 @@ def join(parts: list[Trajectory], attributes: Mapping[str, Any]) -> Trajectory:
 def read_trajectory(path: str | Path) -> Trajectory:
     """All committed frames of a trajectory file, finished or being written. Raises ValueError if it is none."""
     path = Path(path)
-    parts = [_read(path)]
-    attributes = parts[0].attributes
-    done = int(parts[0].step[-1]) if len(parts[0]) else -1
-    for frame in _loose(path):
+    while True:
+        before = _identity(path)
+        whole = _read(path)
+        done = int(whole.step[-1]) if len(whole) else -1
         try:
-            part = _read(frame)
-        except FileNotFoundError:  # merged meanwhile: it is in the file now
-            return read_trajectory(path)
-        if int(part.step[0]) > done:
-            parts.append(part)
-    return join(parts, attributes)
+            loose = [_read(frame) for frame in _loose(path)]
+        except FileNotFoundError:  # merged meanwhile
+            continue
+        if _identity(path) == before:  # the file is replaced before the frames that it took in are removed
+            mine = [p for p in loose if p.attributes.get("run") == whole.attributes.get("run") and int(p.step[0]) > done]
+            return join([whole, *mine], whole.attributes)
 
 
 class TrajectoryWriter:
     """Appends frames to `path`; `close` leaves one plain file."""
 
     def __init__(self, path: Path, attributes: Mapping[str, Any], frames: list[Trajectory]) -> None:
-        """Starts the file with the given frames (those before a restart, or the initial one), replacing what was there."""
+        """Starts the file with the given frames (those before a restart, or the initial one), replacing what was there.
+
+        The attribute "run" tells its loose frames from those of a run that it replaces.
+        """
         self.path = path
         self.attributes = dict(attributes)
-        path.parent.mkdir(parents=True, exist_ok=True)
         merged = join(frames, self.attributes)
         self._write(path, merged)
         shutil.rmtree(_folder(path), ignore_errors=True)
@@ -153,12 +155,24 @@ def _read(path: Path) -> Trajectory:
         raise FileNotFoundError(f"trajectory {path} does not exist")
     try:
         with h5py.File(path, "r") as file:
-            missing = {"t", "step", "X", "diagnostics"} - set(file)
+            needed = ["t", "step", "X", *(f"diagnostics/{name}" for name in DIAGNOSTICS)]
+            missing = [name for name in needed if name not in file]
             if missing or file.attrs.get("schema") != SCHEMA:
-                lacks = f"it lacks {', '.join(sorted(missing))}" if missing else f"its schema is {file.attrs.get('schema')}"
+                lacks = f"it lacks {', '.join(missing)}" if missing else f"its schema is {file.attrs.get('schema')}"
                 raise ValueError(f"{path} is not a trajectory of schema {SCHEMA}: {lacks}")
             sigma = file["sigma"][:] if "sigma" in file else None
             diagnostics = {name: file["diagnostics"][name][:] for name in DIAGNOSTICS}
             return Trajectory(file["t"][:], file["step"][:], file["X"][:], sigma, diagnostics, dict(file.attrs))
     except OSError as error:
-        raise ValueError(f"{path} cannot be read as HDF5: {error}") from None
+        if not path.exists():
+            raise FileNotFoundError(f"trajectory {path} does not exist") from None
+        raise ValueError(f"{path} cannot be read as HDF5: {one_line(error)}") from None
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Changes whenever the file is replaced."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_mtime_ns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
 import h5py
@@ -16,6 +15,7 @@ from biem.curves.shapes import ellipse, equilibrium, perturbed
 from biem.scene.config import Scene, Vesicles, time_value
 from biem.scene.flows import BackgroundFlow, capillary_factor, make_flow
 
+MOST_STEPS = 1e12
 SHAPES = {"equilibrium": equilibrium, "ellipse": ellipse}
 
 
@@ -54,6 +54,9 @@ def build(scene: Scene) -> Problem:
     units = {"t_gamma": flow.time_scale, "t_kappa": t_kappa}
     dt = time_value(scene.time.dt, "dt", units)
     horizon = time_value(scene.time.horizon, "horizon", units)
+    if not horizon / dt < MOST_STEPS:
+        raise ValueError(f"time.horizon is {horizon / dt:.3g} times time.dt: at most {MOST_STEPS:.0e} steps are made")
+    flow.velocity(X, 0.0)  # a custom flow shows here what is wrong with it
     points = scene.solver.operator_points
     if points is not None and points < X.shape[-1]:
         raise ValueError(f"solver.operator_points = {points} is below vesicles.points = {X.shape[-1]}: choose at least as many")
@@ -127,19 +130,23 @@ def _count_and_box(v: Vesicles, one: float) -> tuple[int, tuple[float, float]]:
 
 def _from_file(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     v = scene.vesicles
-    unused = v.model_fields_set - {"file"}
+    unused = [name for name, field in Vesicles.model_fields.items() if name != "file" and getattr(v, name) != field.default]
     if unused:
-        raise ValueError(f"vesicles.file excludes vesicles.{sorted(unused)[0]}: the file holds the shapes and where they are")
+        raise ValueError(f"vesicles.file excludes vesicles.{unused[0]}: the file holds the shapes and where they are")
     path = scene.folder / str(v.file)
     try:
         with h5py.File(path, "r") as file:
-            if "X" not in file:
+            if not isinstance(file.get("X"), h5py.Dataset):
                 raise ValueError(f"vesicles.file {path} has no dataset X; it has {', '.join(file) or 'none'}")
+            run = file.attrs.get("run")
             X = np.asarray(file["X"][-1] if file["X"].ndim == 4 else file["X"], dtype=np.float64)
+        for newest in sorted(path.with_name(path.name + ".frames").glob("[0-9]*.h5"))[-1:]:  # of a run that did not end
+            with h5py.File(newest, "r") as file:
+                X = np.asarray(file["X"][-1], dtype=np.float64) if file.attrs.get("run") == run else X
     except FileNotFoundError:
         raise ValueError(f"vesicles.file {path} does not exist (paths are relative to the scene)") from None
     except OSError as error:
-        raise ValueError(f"vesicles.file {path} cannot be read as HDF5: {error}") from None
+        raise ValueError(f"vesicles.file {path} cannot be read as HDF5: {' '.join(str(error).split())}") from None
     if X.ndim != 3 or X.shape[1] != 2 or X.shape[0] == 0:
         raise ValueError(f"vesicles.file {path}: X has shape {X.shape}, expected (M, 2, N)")
     if X.shape[2] < 16 or X.shape[2] % 2:
@@ -148,8 +155,9 @@ def _from_file(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
         m, c, k = np.argwhere(~np.isfinite(X))[0]
         raise ValueError(f"vesicles.file {path}: X is {X[m, c, k]} at vesicle {m}, component {'xy'[c]}, node {k}")
     gap = np.hypot(*np.moveaxis(X - np.roll(X, -1, axis=-1), 1, 0))
-    if (gap == 0).any():
-        m, k = np.argwhere(gap == 0)[0]
+    same = gap <= 1e-12 * gap.max()
+    if same.any():
+        m, k = np.argwhere(same)[0]
         raise ValueError(
             f"vesicles.file {path}: nodes {k} and {(k + 1) % X.shape[2]} of vesicle {m} are the same point; "
             "a closed curve does not repeat its first node"
@@ -211,6 +219,4 @@ def _flow(scene: Scene, radius: float) -> BackgroundFlow:
         if width is None:
             raise ValueError(f"flow {f.kind} needs a width (or a confinement)")
         rate = f.u_max / width
-    if f.kind == "custom" and str(scene.folder.resolve()) not in sys.path:
-        sys.path.insert(0, str(scene.folder.resolve()))
-    return make_flow(f.kind, rate, width, f.function)
+    return make_flow(f.kind, rate, width, f.function, scene.folder)

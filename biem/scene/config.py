@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 Kind = Literal["quiescent", "shear", "extensional", "poiseuille", "taylor_green", "rotation", "custom"]
 Correction = Literal["redistribute", "area_length"]
@@ -64,7 +65,7 @@ class Time(Table):
     dt: float | str
     horizon: float | str
     save_every: int = Field(1, ge=1)
-    order: Literal[1, 2] = 1  # 2: each step against two half steps, locally extrapolated; three times the work
+    order: int = Field(1, ge=1, le=2)  # 2: each step against two half steps, locally extrapolated; three times the work
 
 
 class Solver(Table):
@@ -89,7 +90,7 @@ class Output(Table):
 
 
 class Scene(Table):
-    """A validated scene. `folder` is where its files are looked for; it is not a key of the file."""
+    """A validated scene."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
     physics: Physics = Physics()  # type: ignore[call-arg]
@@ -98,7 +99,12 @@ class Scene(Table):
     time: Time
     solver: Solver = Solver()  # type: ignore[call-arg]
     output: Output = Output()  # type: ignore[call-arg]
-    folder: Path = Field(Path("."), exclude=True)
+    _folder: Path = PrivateAttr(Path("."))
+
+    @property
+    def folder(self) -> Path:
+        """Where the scene's files are looked for."""
+        return self._folder
 
 
 def load_scene(path: str | Path, overrides: Iterable[str] = ()) -> Scene:
@@ -121,9 +127,11 @@ def load_scene(path: str | Path, overrides: Iterable[str] = ()) -> Scene:
 def make_scene(table: dict[str, Any], folder: str | Path = ".") -> Scene:
     """The scene of a dictionary in the layout of the file. Raises ValueError with one line for what is wrong."""
     try:
-        return Scene.model_validate({**table, "folder": Path(folder)})
+        scene = Scene.model_validate_json(json.dumps(table, default=str), strict=True)  # as JSON: lists may be tuples, true is no 1
     except ValidationError as error:
         raise ValueError("; ".join(dict.fromkeys(_explain(e) for e in error.errors()))) from None
+    scene._folder = Path(folder)
+    return scene
 
 
 def time_value(value: float | str, key: str, units: dict[str, float | None]) -> float:
@@ -171,7 +179,7 @@ def _explain(error: Any) -> str:
         model: Any = Scene
         for part in error["loc"][:-1]:
             model = model.model_fields[part].annotation
-        known = [name for name in model.model_fields if name != "folder"]
+        known = list(model.model_fields)
         near = difflib.get_close_matches(str(error["loc"][-1]), known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else "the keys there are " + ", ".join(known)
         return f"unknown key {path}: {hint}"

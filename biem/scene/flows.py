@@ -15,8 +15,11 @@ Capillary numbers are mu R^3 rate / kappa_b, in Poiseuille flow twice that; Cn =
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from array_api_compat import array_namespace
@@ -48,14 +51,19 @@ def capillary_factor(kind: str) -> float:
     return 2.0 if kind == "poiseuille" else 1.0
 
 
-def make_flow(kind: str, rate: float | None = None, width: float | None = None, function: str | None = None) -> BackgroundFlow:
-    """The flow of that kind. Raises ValueError for an unknown kind or a missing rate, width or function."""
+def make_flow(
+    kind: str, rate: float | None = None, width: float | None = None, function: str | None = None, folder: Path = Path(".")
+) -> BackgroundFlow:
+    """The flow of that kind. Raises ValueError for an unknown kind or a missing rate, width or function.
+
+    The module of a custom function is looked for in `folder`, then among the installed ones.
+    """
     if kind not in KINDS:
         raise ValueError(f'flow.kind = "{kind}": expected one of ' + ", ".join(KINDS))
     if kind == "quiescent":
         return BackgroundFlow(kind, lambda X, t: 0.0 * X, None)
     if kind == "custom":
-        return BackgroundFlow(kind, _custom(function), rate, width)
+        return BackgroundFlow(kind, _custom(function, folder), rate, width)
     if rate is None:
         raise ValueError(f"flow {kind} needs a rate (or u_max, or capillary)")
     if kind in NEEDS_WIDTH and not width:
@@ -87,28 +95,45 @@ def _vortex(xp: Any, x: Array, y: Array, rate: float, W: float) -> tuple[Array, 
     return -scale * y, scale * x
 
 
-def _custom(function: str | None) -> Callable[[Array, float], Array]:
+def _custom(function: str | None, folder: Path) -> Callable[[Array, float], Array]:
     if not function:
         raise ValueError('flow custom needs function = "module.name"')
     module, _, name = function.replace(":", ".").rpartition(".")
     try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f'flow.function = "{function}" cannot be imported ({error}): expected "module.name" of a callable') from error
+        found = getattr(_import(module, folder), name)
+    except Exception as error:  # whatever the user's module raises
+        raise ValueError(
+            f'flow.function = "{function}" cannot be imported ({type(error).__name__}: {error}): expected "module.name" of a callable'
+        ) from error
     if not callable(found):
         raise ValueError(f'flow.function = "{function}" is not callable: expected velocity(x, y, t) -> (u, v)')
 
     def velocity(X: Array, t: float) -> Array:
         xp = array_namespace(X)
-        out = found(X[:, 0], X[:, 1], t)
         try:
-            u, v = out
+            u, v = found(X[:, 0], X[:, 1], t)
             stacked = xp.stack([u + 0.0 * X[:, 0], v + 0.0 * X[:, 1]], axis=1)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{function}(x, y, t) must return (u, v) of the shape of x: {error}") from error
+            assert stacked.shape == X.shape, f"got arrays of shape {tuple(stacked.shape)}"
+        except Exception as error:
+            raise ValueError(
+                f"{function}(x, y, t) must return (u, v) of the shape of x; it ended in {type(error).__name__}: {error}"
+            ) from error
         if not bool(xp.all(xp.isfinite(stacked))):
             bad = to_numpy(X).transpose(0, 2, 1)[~to_numpy(xp.isfinite(stacked)).all(axis=1)][0]
             raise ValueError(f"{function} is not finite at x = {bad[0]:g}, y = {bad[1]:g}, t = {t:g}")
         return stacked
 
     return velocity
+
+
+def _import(module: str, folder: Path) -> ModuleType:
+    """The module of that dotted name in `folder`, else the installed one."""
+    file = folder.joinpath(*module.split(".")).with_suffix(".py")
+    if not file.is_file():
+        return importlib.import_module(module)
+    spec = importlib.util.spec_from_file_location(f"{module}_of_{abs(hash(file.resolve()))}", file)
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded

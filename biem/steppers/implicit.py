@@ -27,7 +27,7 @@ from biem.membrane.operators import VesicleOperators, bending_force, membrane_fo
 from biem.steppers.stepper import Flow, State, StepResult
 from biem.stokes.farfield_direct import direct_sum
 from biem.stokes.near import apply_rows, near_correction, near_width
-from biem.stokes.near_search import NearPairs, find_near
+from biem.stokes.near_search import NearPairs, find_near, minimum_gap
 from biem.stokes.single_layer import near_scheme
 
 CHUNK_VALUES = 1 << 15  # matrix entries per operator of one chunk of vesicles: they stay in the cache
@@ -155,7 +155,7 @@ class ImplicitStepper:
         if not residual <= 10.0 * self.tolerance:
             raise NumericalFailure(
                 f"GMRES stopped at a relative residual of {residual:.1e} (wanted {self.tolerance:.1e}) after {iterations} iterations, "
-                f"smallest gap between nodes and membranes {coupling.gap:.2e}: take smaller steps or more nodes"
+                f"smallest gap between nodes and membranes {minimum_gap(coupling.X):.2e}: take smaller steps or more nodes"
             )
         return from_numpy(solution.reshape(rhs.shape), like=rhs), iterations
 
@@ -200,7 +200,6 @@ class Coupling:
     owner: Array
     pairs: NearPairs | None
     rows: Array | None
-    gap: float
 
     @classmethod
     def build(cls, X: Array, mu: float, scheme: str, tolerance: float) -> Coupling:
@@ -208,14 +207,13 @@ class Coupling:
         M, _, N = X.shape
         targets = xp.reshape(xp.permute_dims(X, (0, 2, 1)), (M * N, 2))
         owner = from_numpy(np.repeat(np.arange(M), N), like=X)
-        coupling = cls(X, mu, arclength_weights(X)[:, None, :], targets, owner, None, None, float("inf"))
+        coupling = cls(X, mu, arclength_weights(X)[:, None, :], targets, owner, None, None)
         if scheme == "none":
             return coupling
         pairs = find_near(X, targets, near_width(scheme, tolerance), owner)
         if len(pairs) == 0:
             return coupling
-        gap = float(np.abs(pairs.distance).min())
-        return replace(coupling, pairs=pairs, rows=near_correction(X, targets, pairs, mu, scheme, tolerance), gap=gap)
+        return replace(coupling, pairs=pairs, rows=near_correction(X, targets, pairs, mu, scheme, tolerance))
 
     def velocity(self, f: Array) -> Array:
         """(M, 2, N) for force densities f (M, 2, N)."""

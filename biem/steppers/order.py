@@ -1,6 +1,6 @@
 """Second order in time by local extrapolation: one step of dt against two of dt/2, as a stepper around a first-order stepper.
 
-    X = 2 X_{dt/2, dt/2} - X_dt,     error estimate max |X_{dt/2, dt/2} - X_dt| over the mean length of the membranes
+X = 2 X_{dt/2, dt/2} - X_dt,     error estimate max |X_{dt/2, dt/2} - X_dt| over the mean length of the membranes
 """
 
 from __future__ import annotations

@@ -27,9 +27,10 @@ def stokeslet_prefactor(mu: float) -> float:
 
 
 def stokeslet(rx: Array, ry: Array, mu: float) -> tuple[Array, Array, Array]:
-    """G_xx, G_xy, G_yy at separations (rx, ry), each of their shape."""
+    """G_xx, G_xy, G_yy at separations (rx, ry), each of their shape; 0 where the points coincide."""
     xp = array_namespace(rx)
     r2 = rx * rx + ry * ry
+    r2 = xp.where(r2 == 0.0, xp.ones_like(r2), r2)
     scale = stokeslet_prefactor(mu)
     log_term = (0.5 * LOG_SIGN * scale) * xp.log(r2)
     rx_scaled = scale * rx / r2

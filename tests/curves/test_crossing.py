@@ -42,7 +42,7 @@ def test_a_small_circle_in_the_waist_of_a_coarse_dumbbell(gap, crossings):
     foot = np.array([np.cos(t), np.sin(t) * (0.1 + 0.4 * np.cos(t) ** 2)])
     tangent = np.array([-np.sin(t), np.cos(t) * (0.1 + 0.4 * np.cos(t) ** 2) - 0.8 * np.sin(t) ** 2 * np.cos(t)])
     normal = np.array([tangent[1], -tangent[0]]) / np.hypot(*tangent)
-    X = np.stack([dumbbell(N, 0.2), circle(N, 0.5, foot + (0.5 + gap) * normal)])
+    X = np.stack([dumbbell(N, 0.2), circle(N, 0.1, foot + (0.1 + gap) * normal)])
     assert pair_crossings(X) == crossings
 
 

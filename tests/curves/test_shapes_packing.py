@@ -141,7 +141,7 @@ def test_the_same_seed_gives_the_same_packing_of_vesicles_of_full_size():
 
 @pytest.mark.parametrize(("count", "gap"), [(12, 0.02), (4, 0.4)])
 def test_random_packing_that_does_not_fit_raises(monkeypatch, count, gap):
-    monkeypatch.setattr(packing, "MOST_MOVES", 30)
+    monkeypatch.setattr(packing, "MOST_MOVES", 10)
     shapes = np.stack([ellipse(32, 0.8)] * count)
     with pytest.raises(ValueError, match=f"{count} vesicles"):
         packing.random_packing(shapes, (0.6, 0.6), gap, np.random.default_rng(0))

@@ -62,6 +62,10 @@ def test_scene_in_the_attributes_makes_the_run_again(tmp_path):
     done = simulate(scene_of(PAIR), tmp_path / "out.h5").trajectory
     again = make_scene(json.loads(done.attributes["scene"]), tmp_path)
     assert np.array_equal(build(again).X, done.X[0])
+
+
+def test_scene_in_the_attributes_may_have_a_file(tmp_path):
+    done = simulate(scene_of(PAIR), tmp_path / "out.h5").trajectory
     from_file = make_scene({**table(), "vesicles": {"file": "out.h5"}}, tmp_path)
     resolved = simulate(from_file).trajectory.attributes["scene"]
     assert make_scene(json.loads(resolved), tmp_path) == from_file

@@ -60,13 +60,18 @@ def test_writer_killed_while_merging_doubles_no_frame(tmp_path, writer, monkeypa
     for k in (1, 2):
         writer.append(frame(k))
 
-    def killed(*_, **__):
-        raise KeyboardInterrupt
+    remove = Path.unlink
+
+    def killed(path, **options):
+        if path.name == "000000000002.h5":
+            raise KeyboardInterrupt
+        remove(path, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr("pathlib.Path.unlink", killed)
         with pytest.raises(KeyboardInterrupt):
             writer.append(frame(3))
+    assert len(list((tmp_path / "out.h5.frames").glob("*.h5"))) == 2  # in the file too by now
     assert_same_frames(read_trajectory(tmp_path / "out.h5"), frames(4))
 
 

@@ -95,7 +95,10 @@ def test_unknown_tables_and_keys_far_from_any_name(tmp_path):
     path = write_scene(tmp_path)
     assert "did you mean vesicles?" in refusal(path, "vesicle.points=16")
     assert "kappa_b, mu" in refusal(path, "physics.zzz=1")  # no name is near: the valid ones are listed
-    assert "unknown key folder" in refusal(path, 'folder="elsewhere"')  # what the loader knows is not a key of the file
+
+
+def test_where_a_scene_lies_is_no_key_of_it(tmp_path):
+    assert "unknown key folder" in refusal(write_scene(tmp_path), 'folder="elsewhere"')
 
 
 @pytest.mark.parametrize("missing", ["time.dt", "time.horizon"])

@@ -35,16 +35,16 @@ def test_overlapping_centers_are_refused_with_the_pair():
 @pytest.mark.parametrize("placement", ["grid", "random"])
 @pytest.mark.parametrize("shape", ["ellipse", "perturbed"])
 def test_packings_keep_count_gap_box_and_seed(placement, shape):
-    keys = {"placement": placement, "shape": shape, "count": 6, "box": [1.4, 1.0], "corner": [3.0, -1.0], "gap": 0.03, "seed": 5}
+    keys = {"placement": placement, "shape": shape, "count": 4, "box": [1.0, 1.0], "corner": [3.0, -1.0], "gap": 0.03, "seed": 5}
     X = placed(**keys)
-    assert X.shape == (6, 2, 32)
+    assert X.shape == (4, 2, 32)
     assert minimum_gap(X) >= 0.03 - 1e-9
     assert (X[:, 0].min(), X[:, 1].min()) >= (3.0, -1.0)
-    assert (X[:, 0].max(), X[:, 1].max()) <= (4.4, 0.0)
+    assert (X[:, 0].max(), X[:, 1].max()) <= (4.0, 0.0)
     assert np.array_equal(placed(**keys), X)
     if (placement, shape) != ("grid", "ellipse"):
         assert not np.array_equal(placed(**{**keys, "seed": 6}), X)
-    fraction = placed(placement=placement, shape=shape, area_fraction=0.2, count=6)
+    fraction = placed(placement=placement, shape=shape, area_fraction=0.2, count=4)
     assert np.abs(fraction).max() < 0.5 * np.sqrt(area(fraction).sum() / 0.2)  # the box, centred on the origin
 
 
