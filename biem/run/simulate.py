@@ -148,7 +148,7 @@ class _Loop:
             while self.step < self.problem.steps:
                 try:
                     self._advance()
-                except NumericalFailure as failure:
+                except (NumericalFailure, ValueError) as failure:  # ValueError: the flow refused a point or a time
                     self._close_with_this_state()
                     unit = self.problem.flow.time_scale
                     when = f"t = {self.state.t:.6g}" + (f" ({self.state.t / unit:.4g} t_gamma)" if unit else "")

@@ -4,10 +4,14 @@ import sys
 
 import numpy as np
 import pytest
-from scene_helpers import scene_of, write_flow
+from scene_helpers import DT, scene_of, write_flow
 
+from biem.errors import NumericalFailure
+from biem.run.checkpoint import checkpoint_path, read_checkpoint
 from biem.run.simulate import simulate
+from biem.run.trajectory import read_trajectory
 from biem.scene.build import build
+from biem.scene.config import make_scene
 
 X = np.random.default_rng(0).uniform(-1.0, 1.0, size=(2, 2, 5))
 x, y = X[:, 0], X[:, 1]
@@ -69,3 +73,12 @@ def test_a_custom_flow_that_is_not_finite_says_where_and_when(tmp_path):
 def test_a_custom_flow_that_cannot_be_imported_is_refused(tmp_path, function, body):
     with pytest.raises(ValueError, match=rf"flow\.function = .*{function}"):
         custom(tmp_path, body, function)
+
+
+def test_a_custom_flow_that_fails_on_the_way_leaves_the_last_good_state(tmp_path):
+    scene = custom(tmp_path, f"return np.where(t > {2.5 * DT}, np.nan, y), 0 * x").scene  # met by the fourth step
+    scene = make_scene({**scene.model_dump(mode="json"), "time": {"dt": DT, "horizon": 6 * DT, "save_every": 5}}, tmp_path)
+    with pytest.raises(NumericalFailure, match=r"step 4 rejected.*flow_.*\.f is not finite at x = .*, t = "):
+        simulate(scene, tmp_path / "out.h5")
+    assert read_trajectory(tmp_path / "out.h5").step.tolist() == [0, 3]
+    assert read_checkpoint(checkpoint_path(tmp_path / "out.h5")).step == 3
