@@ -30,7 +30,7 @@ from biem.stokes.near import apply_rows, near_correction, near_width
 from biem.stokes.near_search import NearPairs, find_near, minimum_gap
 from biem.stokes.single_layer import near_scheme
 
-CHUNK_VALUES = 1 << 15  # matrix entries per operator of one chunk of vesicles: they stay in the cache
+CHUNK_VALUES = 1 << 16  # matrix entries per operator of one chunk of vesicles: they stay in the cache
 
 
 @dataclass(frozen=True)
