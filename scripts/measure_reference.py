@@ -18,7 +18,7 @@ from biem.curves.fourier import coefficients, evaluate, read_back, resample
 from biem.curves.reparam import redistribute
 from biem.steppers.corrections import CORRECTIONS, Corrected
 from biem.steppers.implicit import ImplicitStepper
-from biem.steppers.stepper import State
+from biem.steppers.stepper import State, Stepper
 from biem.stokes.near_search import find_near
 from biem.stokes.quadrature import full_matrix
 
@@ -141,7 +141,7 @@ def shear_single() -> None:
             state = State(0.0, X)
             for _ in range(round(40 / step)):
                 state = stepper.step(state, step * t_gamma).state
-            found.append((float(inclination(state.X)[0]), tank_treading(stepper.inner, state, step) * t_gamma))
+            found.append((float(inclination(state.X)[0]), tank_treading(stepper.inner, state) * t_gamma))
         extrapolated = [(a - 6 * b + 8 * c) / 3 for a, b, c in zip(*found, strict=True)]
         for k, name in enumerate(("inclination", "frequency / rate")):
             values = [f[k] for f in found] + [extrapolated[k]]
@@ -149,10 +149,10 @@ def shear_single() -> None:
     table(["Ca", "", "dt = 0.02", "0.01", "0.005", "dt -> 0", "known", "difference"], rows)
 
 
-def tank_treading(stepper: object, state: State, step: float) -> float:
+def tank_treading(stepper: Stepper, state: State) -> float:
     """Angular frequency of the membrane, -2 pi v / L with v the mean tangential velocity of the instantaneous motion."""
     dt = 1e-9
-    moved = stepper.step(state, dt).state.X  # type: ignore[attr-defined]
+    moved = stepper.step(state, dt).state.X
     n = normal(state.X)
     tangent = np.stack([-n[:, 1], n[:, 0]], axis=1)
     velocity = (moved - state.X) / dt

@@ -93,12 +93,12 @@ class Scene(Table):
     """A validated scene."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
-    physics: Physics = Physics()  # type: ignore[call-arg]
-    vesicles: Vesicles = Vesicles()  # type: ignore[call-arg]
-    flow: FlowTable = FlowTable()  # type: ignore[call-arg]
+    physics: Physics = Physics()
+    vesicles: Vesicles = Vesicles()
+    flow: FlowTable = FlowTable()
     time: Time
-    solver: Solver = Solver()  # type: ignore[call-arg]
-    output: Output = Output()  # type: ignore[call-arg]
+    solver: Solver = Solver()
+    output: Output = Output()
     _folder: Path = PrivateAttr(Path("."))
 
     @property

@@ -12,6 +12,7 @@ velocity of the present forces, so a step depends on (X^n, sigma^n) alone. Paper
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -127,7 +128,7 @@ class ImplicitStepper:
             force[..., 1:],
         )
 
-    def _gmres(self, apply, rhs: Array, guess: Array, coupling: Coupling) -> tuple[Array, int]:  # type: ignore[no-untyped-def]
+    def _gmres(self, apply: Callable[[Array], Array], rhs: Array, guess: Array, coupling: Coupling) -> tuple[Array, int]:
         """u with apply(u) = rhs, and the iterations taken; the true residual is checked."""
         size = int(np.prod(rhs.shape))
         iterations = 0
