@@ -87,6 +87,8 @@ def simulate(scene: Scene, output: str | Path | None = None, *, resume: bool = F
         raise ValueError("resume needs the output of the run to go on with")
     if path is not None and exists(path) and not (resume or force):
         raise ValueError(f"output {path} exists: use --force to replace it or --resume to go on")
+    if resume and force:
+        raise ValueError("--resume goes on with the output, --force replaces it: give one of them")
     resolved = json.dumps(scene.model_dump(mode="json"))
     if resume:
         assert path is not None

@@ -22,7 +22,7 @@ class Check:
 
 
 def verify(trajectory: Trajectory) -> list[Check]:
-    """Finite values, rising times, areas and lengths against the first frame, crossings, stored energies, the horizon."""
+    """Finite values, rising times, areas and lengths against the first frame, crossings, stored energies."""
     X, t = trajectory.X, trajectory.t
     scene = json.loads(trajectory.attributes["scene"])
     finite = bool(np.isfinite(X).all() and np.isfinite(t).all() and (trajectory.sigma is None or np.isfinite(trajectory.sigma).all()))

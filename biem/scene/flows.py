@@ -113,7 +113,8 @@ def _custom(function: str | None, folder: Path) -> Callable[[Array, float], Arra
         try:
             u, v = found(X[:, 0], X[:, 1], t)
             stacked = xp.stack([u + 0.0 * X[:, 0], v + 0.0 * X[:, 1]], axis=1)
-            assert stacked.shape == X.shape, f"got arrays of shape {tuple(stacked.shape)}"
+            if stacked.shape != X.shape:
+                raise ValueError(f"arrays of shape {tuple(stacked.shape)}")
         except Exception as error:
             raise ValueError(
                 f"{function}(x, y, t) must return (u, v) of the shape of x; it ended in {type(error).__name__}: {error}"
