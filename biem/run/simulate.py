@@ -312,7 +312,7 @@ def _check_space(problem: Problem, path: Path) -> None:
     needed, free = 2.2 * trajectory_bytes(problem), shutil.disk_usage(folder).free  # merging holds two copies
     if needed > free:
         raise ValueError(
-            f"output {path} needs about {needed / 1e6:.0f} MB, {free / 1e6:.0f} MB are free: raise time.save_every or choose another disk"
+            f"output {path} needs about {needed / 1e6:.2g} MB, {free / 1e6:.2g} MB are free: raise time.save_every or choose another disk"
         )
 
 
