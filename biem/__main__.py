@@ -16,7 +16,9 @@ from tqdm import tqdm
 from biem.backend import fft_backend
 from biem.curves.curve import area, length
 from biem.errors import NumericalFailure
-from biem.run.simulate import Stopped, make_stepper, simulate
+from biem.ranks import ALONE, Ranks, world
+from biem.run.simulate import Stopped, simulate
+from biem.run.solver import make_stepper, on_device
 from biem.run.trajectory import Trajectory, read_trajectory
 from biem.scene.build import Problem, build
 from biem.scene.config import Scene, load_scene
@@ -32,24 +34,28 @@ TrajectoryPath = Annotated[Path, typer.Argument(help="Trajectory (HDF5).", metav
 
 
 @contextmanager
-def one_line_errors() -> Iterator[None]:
-    """Errors that are the input's or the disk's end in one line and an exit code, not in a traceback."""
+def one_line_errors(ranks: Ranks = ALONE) -> Iterator[None]:
+    """Errors that are the input's or the disk's end in one line, of the first rank, and an exit code, not in a traceback."""
     try:
         yield
     except NumericalFailure as error:
-        _fail(str(error), 3)
+        _fail(str(error), 3, ranks)
     except Stopped as stopped:
-        _fail(f"{stopped}; go on with --resume", 4)
+        _fail(f"{stopped}; go on with --resume", 4, ranks)
     except FileNotFoundError as error:
-        _fail(str(error), 2)
+        _fail(str(error), 2, ranks)
     except OSError as error:
-        _fail(f"file error: {error}", 5)
+        _fail(f"file error: {error}", 5, ranks)
     except (ValueError, MemoryError) as error:
-        _fail(str(error), 2)
+        _fail(str(error), 2, ranks)
+    except Exception:
+        ranks.abort()  # one rank alone: the others would wait for it
+        raise
 
 
-def _fail(message: str, code: int) -> None:
-    typer.echo(f"error: {message}", err=True)
+def _fail(message: str, code: int, ranks: Ranks = ALONE) -> None:
+    if ranks.rank == 0:
+        typer.echo(f"error: {message}", err=True)
     raise typer.Exit(code)
 
 
@@ -63,14 +69,16 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
     overrides: Overrides = None,
 ) -> None:
-    """Run a scene to its horizon."""
+    """Run a scene to its horizon; under mpirun, its vesicles shared among the processes."""
     with one_line_errors():
+        ranks = world()
+    with one_line_errors(ranks):
         loaded = _load(scene, solver, overrides)
         path = output or Path(loaded.output.trajectory or f"out/{loaded.name}.h5")
-        for notice in build(loaded).notices if loaded.vesicles.file else ():
+        for notice in build(loaded).notices if loaded.vesicles.file and ranks.rank == 0 else ():
             typer.echo(f"notice: {notice}", err=True)
-        done = simulate(loaded, path, resume=resume, force=force, progress=not quiet)
-        if not quiet:
+        done = simulate(loaded, path, resume=resume, force=force, progress=not quiet, ranks=ranks)
+        if not quiet and ranks.rank == 0:
             typer.echo(_summary(done.trajectory, path, done.counts))
 
 
@@ -85,9 +93,9 @@ def plan(
     with one_line_errors():
         problem = build(_load(scene, solver, overrides))
         M, _, N = problem.X.shape
-        typer.echo(
-            f"{problem.scene.name}: {M} vesicle(s) of {N} nodes, {problem.steps} steps of dt = {problem.dt:.6g}{_in_flow_times(problem)}"
-        )
+        adaptive = problem.scene.time.adaptive
+        steps = "adaptive steps, their number not known, the first one of" if adaptive else f"{problem.steps} steps of"
+        typer.echo(f"{problem.scene.name}: {M} vesicle(s) of {N} nodes, {steps} dt = {problem.dt:.6g}{_in_flow_times(problem)}")
         parts = required_parts(problem)
         wide = max(len(p.name) for p in parts)
         for part in parts:
@@ -95,7 +103,8 @@ def plan(
         typer.echo(f"memory of a step: {memory_estimate(problem) / 1e6:.0f} MB; trajectory: {trajectory_bytes(problem) / 1e6:.1f} MB")
         if measure:
             seconds = _seconds_a_step(problem)
-            typer.echo(f"time: {seconds:.3g} s a step here, about {_clock(seconds * problem.steps)} in all")
+            total = "if all are as long as the first one" if adaptive else "in all"
+            typer.echo(f"time: {seconds:.3g} s a step here, about {_clock(seconds * problem.steps)} {total}")
 
 
 @app.command()
@@ -140,7 +149,7 @@ def _seconds_a_step(problem: Problem) -> float:
     """Wall time of the second of two steps: the first one compiles and plans."""
     stepper = make_stepper(problem, area(problem.X), length(problem.X))
     with fft_backend(problem.X.size):
-        state = stepper.step(State(0.0, problem.X), problem.dt).state
+        state = stepper.step(on_device(State(0.0, problem.X), problem.scene), problem.dt).state
         begin = time.perf_counter()
         stepper.step(state, problem.dt)
         return time.perf_counter() - begin
@@ -160,7 +169,8 @@ def _summary(trajectory: Trajectory, path: Path, counts: Counter[str]) -> str:
         f"largest error of a step, before correction: area {d['area_error'].max():.1e}, length {d['length_error'].max():.1e}",
     ]
     if trajectory.X.shape[1] > 1:
-        lines.append(f"smallest gap {d['min_gap'].min():.4g}; at most {d['gmres_iterations'].max():.0f} GMRES iterations a step")
+        gmres = d["gmres_iterations"].max()
+        lines.append(f"smallest gap {d['min_gap'].min():.4g}" + (f"; at most {gmres:.0f} GMRES iterations a step" if gmres else ""))
     lines.append("used: " + ", ".join(f"{name} {n}" for name, n in sorted(counts.items())))
     return "\n".join(lines)
 

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar, copy_context
 from functools import cache, lru_cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -80,12 +81,26 @@ def from_numpy(a: np.ndarray, like: Array) -> Array:
     return xp.asarray(a, dtype=like.dtype if a.dtype.kind == "f" else None, device=device(like))
 
 
+def on_cpu(a: Array) -> bool:
+    """Whether compiled loops can work on the memory of `a`: a NumPy array, or a PyTorch tensor of the CPU."""
+    return not is_torch_array(a) or a.device.type == "cpu"
+
+
+def compiled(module: str) -> Any:
+    """A module of compiled loops, set to run on `threads()` threads; numba is loaded here, where it is needed."""
+    import numba
+
+    loops = import_module(module)
+    numba.set_num_threads(min(threads(), numba.config.NUMBA_NUM_THREADS))
+    return loops
+
+
 def solve(A: Array, b: Array) -> Array:
     """Batched dense solve. On the CPU always LAPACK through NumPy.
 
     PyTorch's batched LU on the CPU returns wrong values for n >= 160 with two threads (seen with torch 2.13).
     """
-    if is_torch_array(A) and A.device.type != "cpu":
+    if not on_cpu(A):
         return array_namespace(A).linalg.solve(A, b)
     return from_numpy(np.linalg.solve(to_numpy(A), to_numpy(b)), like=A)
 
@@ -97,6 +112,21 @@ def scatter_add(u: Array, index: Array, values: Array) -> Array:
     out = u.copy()
     np.add.at(out, index, values)
     return out
+
+
+class Latest:
+    """Remembers what was made for the array last seen; the array itself is what it is known by, so it must not change in place."""
+
+    def __init__(self) -> None:
+        self._array: Array = None
+        self._made: Any = None
+
+    def of(self, array: Array, make: Callable[[], Any]) -> Any:
+        """What `make()` gave for this very array, made now if it is another one."""
+        if self._array is not array:
+            self._made = make()
+            self._array = array
+        return self._made
 
 
 def threads() -> int:

@@ -18,11 +18,11 @@ TOLERANCE = 1e-10  # relative, of area and of length
 MAX_ITERATIONS = 60
 
 
-def restore_area_length(X: Array, area_0: Array, length_0: Array) -> tuple[Array, int]:
+def restore_area_length(X: Array, area_0: Array, length_0: Array, first: int = 0) -> tuple[Array, int]:
     """X (M, 2, N) with area and length equal to area_0, length_0 (M,) to 1e-10, and how many vesicles were changed.
 
     Vesicles within the tolerance are returned as they are. On a circle the two gradients are parallel: the least-squares step is
-    taken there. Raises NumericalFailure, naming the vesicle, where no such shape is near.
+    taken there. Raises NumericalFailure, naming the vesicle (counted from `first`), where no such shape is near.
     """
     xp = array_namespace(X)
     off = _errors(X, area_0, length_0)
@@ -43,7 +43,7 @@ def restore_area_length(X: Array, area_0: Array, length_0: Array) -> tuple[Array
             return Y, changed
     worst = int(xp.argmax(xp.max(xp.abs(off), axis=-1)))
     raise NumericalFailure(
-        f"area and length of vesicle {worst} could not be restored: relative errors {float(off[worst, 0]):.1e}, "
+        f"area and length of vesicle {first + worst} could not be restored: relative errors {float(off[worst, 0]):.1e}, "
         f"{float(off[worst, 1]):.1e} after {MAX_ITERATIONS} iterations; use smaller steps"
     )
 

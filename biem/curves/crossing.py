@@ -17,18 +17,20 @@ def polygons(X: Array, refinement: int = COARSE) -> np.ndarray:
     return np.asarray(shapely.polygons(resample(X, refinement * X.shape[-1]).transpose(0, 2, 1)))
 
 
-def self_crossings(X: Array) -> list[int]:
-    """Indices of curves that cross themselves."""
-    suspect = np.flatnonzero(~shapely.is_valid(polygons(X)))
+def self_crossings(X: Array, shapes: np.ndarray | None = None) -> list[int]:
+    """Indices of curves that cross themselves. shapes: polygons(X) where they are at hand."""
+    suspect = np.flatnonzero(~shapely.is_valid(polygons(X) if shapes is None else shapes))
     return [int(i) for i in suspect if not shapely.is_valid(polygons(to_numpy(X)[[i]], FINE)[0])]
 
 
-def pair_crossings(X: Array) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of curves that cross or contain one another."""
+def pair_crossings(X: Array, shapes: np.ndarray | None = None) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of curves that cross or contain one another. shapes: polygons(X) where they are at hand."""
     X = to_numpy(X)
     if X.shape[0] < 2:
         return []
-    shapes = polygons(X)
-    i, j = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    pairs = [(int(a), int(b)) for a, b in zip(i, j, strict=True) if a < b]
+    shapes = polygons(X) if shapes is None else shapes
+    i, j = shapely.STRtree(shapes).query(shapes)  # boxes that meet; to prepare polygons for so few tests each would not pay
+    i, j = i[i < j], j[i < j]
+    meet = shapely.intersects(shapes[i], shapes[j])
+    pairs = zip(i[meet].tolist(), j[meet].tolist(), strict=True)
     return [(a, b) for a, b in pairs if shapely.intersects(*polygons(X[[a, b]], FINE))]

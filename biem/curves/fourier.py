@@ -9,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 from array_api_compat import array_namespace, device
 
-from biem.backend import Array, constant, irfft, rfft
+from biem.backend import Array, compiled, constant, from_numpy, irfft, on_cpu, rfft, to_numpy
+
+COMPILED_ABOVE = 100_000  # cosines in one `evaluate`, from which the compiled loop is worth loading
 
 
 def _wavenumbers(n: int) -> np.ndarray:
@@ -77,6 +79,9 @@ def evaluate(c: Array, alpha: Array, order: int = 0) -> Array:
     n = 2 * (c.shape[-1] - 1)
     if order:
         c = c * (1j * constant(_wavenumbers, n, like=alpha)) ** order
+    if alpha.shape[0] * alpha.shape[1] * n > COMPILED_ABOVE and on_cpu(alpha) and alpha.dtype == xp.float64:
+        values = compiled("biem.curves.fourier_loop").evaluate(to_numpy(c), np.ascontiguousarray(to_numpy(alpha)))
+        return from_numpy(values, like=alpha)
     phase = constant(_all_wavenumbers, n, like=alpha)[:, None] * alpha[:, None, :]
     return xp.matmul(xp.real(c), xp.cos(phase)) - xp.matmul(xp.imag(c), xp.sin(phase))
 

@@ -16,8 +16,11 @@ from biem.errors import NumericalFailure
 REFINEMENT = 2  # the speed has twice the modes of X and is sampled so
 
 
-def equal_arclength_parameters(X: Array) -> Array:
-    """alpha~ (M, N): parameters of N points equally spaced in arclength. Raises NumericalFailure where Newton fails."""
+def equal_arclength_parameters(X: Array, first: int = 0) -> Array:
+    """alpha~ (M, N): parameters of N points equally spaced in arclength. Raises NumericalFailure where Newton fails.
+
+    first: the number by which an error names the first vesicle.
+    """
     xp = array_namespace(X)
     N = X.shape[-1]
     c = coefficients(speed(resample(X - center_of_nodes(X), REFINEMENT * N)))[:, None, :]
@@ -35,12 +38,12 @@ def equal_arclength_parameters(X: Array) -> Array:
         if float(xp.max(xp.abs(step))) < tolerance:
             return alpha
     worst = int(xp.argmax(xp.max(xp.abs(step), axis=-1)))
-    raise NumericalFailure(f"redistribution of vesicle {worst} did not converge: its nodes are too unevenly spaced")
+    raise NumericalFailure(f"redistribution of vesicle {first + worst} did not converge: its nodes are too unevenly spaced")
 
 
-def redistribute(X: Array, *fields: Array) -> tuple[Array, ...]:
-    """X and fields (M, N) on it, at nodes equally spaced in arclength."""
-    alpha = equal_arclength_parameters(X)
+def redistribute(X: Array, *fields: Array, first: int = 0) -> tuple[Array, ...]:
+    """X and fields (M, N) on it, at nodes equally spaced in arclength. first: the number by which an error names the first vesicle."""
+    alpha = equal_arclength_parameters(X, first)
     origin = center_of_nodes(X)
     moved = [origin + remove_nyquist(evaluate(coefficients(X - origin), alpha))]
     moved += [evaluate(coefficients(f)[:, None, :], alpha)[:, 0] for f in fields]

@@ -6,15 +6,15 @@ and reads velocities and tensions back on the N nodes it was given; 2 N removes 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from array_api_compat import array_namespace
 
-from biem.backend import Array, count, solve
+from biem.backend import Array, Latest
 from biem.curves.curve import length, normal
 from biem.curves.fourier import read_back, resample
-from biem.membrane.operators import VesicleOperators
+from biem.membrane.resultants import Resultants
 from biem.stokes.near import layer_values
 
 LAYERS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # offsets of the near layers along the outward normal, in arclength spacings
@@ -56,37 +56,33 @@ def operator_points(N: int, points: int | None = None) -> int:
 
 @dataclass(frozen=True)
 class ExactMaps:
-    """`MembraneMaps` by boundary integrals. kappa_b, mu in the units of X; points: nodes of the operators (default 2 N below 96)."""
+    """`MembraneMaps` by boundary integrals. kappa_b, mu in the units of X; points: nodes of the operators (default 2 N below 96).
+
+    precision: "float64", or "float32" for kernels and solves, while geometry and forces stay float64. The factors of the curves last
+    seen are kept, so that one factorisation serves every map of a step: arrays are not to be changed in place.
+    """
 
     kappa_b: float = 1.0
     mu: float = 1.0
     points: int | None = None
-
-    def operators(self, X: Array) -> VesicleOperators:
-        """The operators of the curves X (M, 2, N), on `points` nodes."""
-        return VesicleOperators(resample(X, operator_points(X.shape[-1], self.points)), self.kappa_b, self.mu)
+    precision: str = "float64"
+    _last: Latest = field(default_factory=Latest, init=False, repr=False, compare=False)
 
     def advect(self, X: Array, u: Array) -> Array:
-        ops = self.operators(X)
-        u = resample(u, ops.X.shape[-1])
-        return read_back(project(ops, u), X.shape[-1])
+        maps = self._resultants(X)
+        return read_back(maps.project(resample(u, maps.X.shape[-1])), X.shape[-1])
 
     def relax(self, X: Array, dt: float) -> Array:
-        xp = array_namespace(X)
-        ops = self.operators(X)
-        M, _, n = ops.X.shape
-        increment, _ = relaxation_system(ops, xp.reshape(ops.bending_velocity(), (M, 2 * n, 1)), dt, False)
         # low-passed, not read back at the nodes: the stiff modes that N nodes cannot hold relax at once, whatever dt is, and would
         # alias into the shape at every step
-        return X + resample(xp.reshape(increment, (M, 2, n)), X.shape[-1])
+        return X + resample(self._build(X).relaxation(dt), X.shape[-1])
 
     def self_tension(self, X: Array) -> Array:
-        ops = self.operators(X)
-        return read_back(inextensible_tension(ops, ops.bending_velocity()), X.shape[-1])
+        return read_back(self._resultants(X).self_tension(), X.shape[-1])
 
     def flow_tension(self, X: Array, u: Array) -> Array:
-        ops = self.operators(X)
-        return read_back(inextensible_tension(ops, resample(u, ops.X.shape[-1])), X.shape[-1])
+        maps = self._resultants(X)
+        return read_back(maps.flow_tension(resample(u, maps.X.shape[-1])), X.shape[-1])
 
     def near_layers(self, X: Array, f: Array) -> Array:
         xp = array_namespace(X)
@@ -98,31 +94,9 @@ class ExactMaps:
         u = layer_values(X, f, points, self.mu)
         return xp.permute_dims(xp.reshape(u, (M, len(LAYERS), N, 2)), (0, 1, 3, 2))
 
+    def _resultants(self, X: Array) -> Resultants:
+        return self._last.of(X, lambda: self._build(X))
 
-def inextensible_tension(ops: VesicleOperators, u: Array) -> Array:
-    """L^-1 P u (M, n) for a velocity u (M, 2, n); the tension is minus this."""
-    M, _, n = u.shape
-    divergence = ops.divergence(array_namespace(u).reshape(u, (M, 2 * n, 1)))
-    return solve(ops.L, divergence)[..., 0]
-
-
-def project(ops: VesicleOperators, u: Array) -> Array:
-    """(1 - M) u (M, 2, n)."""
-    xp = array_namespace(u)
-    return u - xp.reshape(xp.matmul(ops.T, inextensible_tension(ops, u)[..., None]), u.shape)
-
-
-def relaxation_system(ops: VesicleOperators, columns: Array, dt: float, tension: bool) -> tuple[Array, Array | None]:
-    """Increments Z with (1 - dt (1 - M) B) Z = dt (1 - M) C, and tensions -L^-1 P (B Z + C), for velocities C (M, 2n, c).
-
-    With C = B X + u, Z is the increment of the semi-implicit Euler step; solving for it and not for X keeps its digits.
-    """
-    xp = array_namespace(columns)
-    m = columns.shape[-1]
-    B = ops.B
-    count("relaxation_matrix", columns.shape[0])
-    solved = solve(ops.L, ops.divergence(xp.concat([columns, B], axis=-1)))  # L^-1 P [C, B]
-    projected = xp.concat([columns, B], axis=-1) - xp.matmul(ops.T, solved)
-    identity = xp.eye(B.shape[-1], dtype=B.dtype, device=B.device)
-    Z = solve(identity - dt * projected[..., m:], dt * projected[..., :m])
-    return Z, -(xp.matmul(solved[..., m:], Z) + solved[..., :m]) if tension else None
+    def _build(self, X: Array) -> Resultants:
+        dtype = None if self.precision == "float64" else getattr(array_namespace(X), self.precision)
+        return Resultants(resample(X, operator_points(X.shape[-1], self.points)), self.kappa_b, self.mu, dtype)

@@ -131,3 +131,19 @@ class VesicleOperators:
         u_x = xp.matmul(S[:, 0], fx) + xp.matmul(S[:, 1], fy)
         u_y = xp.matmul(S[:, 1], fx) + xp.matmul(S[:, 2], fy)
         return xp.stack([u_x[..., 0], u_y[..., 0]], axis=1)
+
+
+def relaxation_system(ops: VesicleOperators, columns: Array, dt: float, tension: bool) -> tuple[Array, Array | None]:
+    """Increments Z with (1 - dt (1 - M) B) Z = dt (1 - M) C, and tensions -L^-1 P (B Z + C), for velocities C (M, 2n, c).
+
+    With C = B X + u, Z is the increment of the semi-implicit Euler step; solving for it and not for X keeps its digits.
+    """
+    xp = array_namespace(columns)
+    m = columns.shape[-1]
+    B = ops.B
+    count("relaxation_matrix", columns.shape[0])
+    solved = solve(ops.L, ops.divergence(xp.concat([columns, B], axis=-1)))  # L^-1 P [C, B]
+    projected = xp.concat([columns, B], axis=-1) - xp.matmul(ops.T, solved)
+    identity = xp.eye(B.shape[-1], dtype=B.dtype, device=B.device)
+    Z = solve(identity - dt * projected[..., m:], dt * projected[..., :m])
+    return Z, -(xp.matmul(solved[..., m:], Z) + solved[..., :m]) if tension else None

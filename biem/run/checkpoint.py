@@ -9,13 +9,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from biem.backend import to_numpy
 from biem.run.files import atomic_h5
 from biem.steppers.stepper import State
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """State after `step` steps, the initial areas and lengths, and the running diagnostics since the last frame."""
+    """State after `step` steps, the initial areas and lengths, and the running diagnostics since the last frame.
+
+    What is written may be tensors; what is read is NumPy arrays.
+    """
 
     step: int
     state: State
@@ -25,6 +29,7 @@ class Checkpoint:
     running: dict[str, float] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     run: str = ""  # of the trajectory that it belongs to
+    control: dict[str, float] = field(default_factory=dict)  # of adaptive steps: the next dt, and what rounding took from t
 
 
 def checkpoint_path(trajectory: Path) -> Path:
@@ -42,15 +47,20 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 def prepare_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Writes *.next, which counts as the newest checkpoint of its run; raises ValueError if the state is not finite."""
-    state = checkpoint.state
-    if not (np.isfinite(state.X).all() and np.isfinite(state.t) and (state.sigma is None or np.isfinite(state.sigma).all())):
+    t, coupling = checkpoint.state.t, checkpoint.state.coupling
+    arrays = {"X": checkpoint.state.X, "sigma": checkpoint.state.sigma}
+    if coupling is not None:
+        arrays |= {"coupling": coupling[1], "coupling_rate": coupling[2]}
+    arrays = {name: to_numpy(a) for name, a in arrays.items() if a is not None}
+    if not (np.isfinite(t) and all(np.isfinite(a).all() for a in arrays.values())):
         raise ValueError(f"the state at step {checkpoint.step} is not finite: checkpoint {path} is left as it was")
     with atomic_h5(path.with_name(path.name + ".next")) as file:
-        file["X"], file["area_0"], file["length_0"] = state.X, checkpoint.area_0, checkpoint.length_0
-        if state.sigma is not None:
-            file["sigma"] = state.sigma
-        file.attrs.update({"t": state.t, "step": checkpoint.step, "scene": checkpoint.scene, "run": checkpoint.run})
-        for group, values in (("running", checkpoint.running), ("counts", checkpoint.counts)):
+        for name, a in {**arrays, "area_0": checkpoint.area_0, "length_0": checkpoint.length_0}.items():
+            file[name] = a
+        if coupling is not None:
+            file["coupling"].attrs["t"] = coupling[0]
+        file.attrs.update({"t": t, "step": checkpoint.step, "scene": checkpoint.scene, "run": checkpoint.run})
+        for group, values in (("running", checkpoint.running), ("counts", checkpoint.counts), ("control", checkpoint.control)):
             file.create_group(group).attrs.update(values)
 
 
@@ -66,15 +76,19 @@ def read_checkpoint(path: Path, run: str | None = None) -> Checkpoint:
         try:
             with h5py.File(candidate, "r") as file:
                 sigma = file["sigma"][:] if "sigma" in file else None
+                coupling = None
+                if "coupling" in file:
+                    coupling = (float(file["coupling"].attrs["t"]), file["coupling"][:], file["coupling_rate"][:])
                 checkpoint = Checkpoint(
                     int(file.attrs["step"]),
-                    State(float(file.attrs["t"]), file["X"][:], sigma),
+                    State(float(file.attrs["t"]), file["X"][:], sigma, coupling),
                     file["area_0"][:],
                     file["length_0"][:],
                     str(file.attrs["scene"]),
                     {k: float(v) for k, v in file["running"].attrs.items()},
                     {k: int(v) for k, v in file["counts"].attrs.items()},
                     str(file.attrs["run"]),
+                    {k: float(v) for k, v in file["control"].attrs.items()} if "control" in file else {},
                 )
             if run is None or checkpoint.run == run:
                 return checkpoint

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from biem.backend import Array, to_numpy
-from biem.curves.crossing import pair_crossings, self_crossings
+from biem.curves.crossing import pair_crossings, polygons, self_crossings
 from biem.errors import NumericalFailure
 
 
@@ -20,14 +20,15 @@ def check_state(X: Array, sigma: Array | None, diagnostics: Mapping[str, float],
     if sigma is not None and not np.isfinite(to_numpy(sigma)).all():
         raise NumericalFailure("the tension is not finite")
     for name in ("area", "length"):
-        error = diagnostics[f"{name}_error"]
+        error = diagnostics.get(f"{name}_error", 0.0)
         if not error <= max_error:
             raise NumericalFailure(
                 f"{name} of vesicle {int(diagnostics[f'{name}_error_vesicle'])} is off by {error:.2e} (solver.max_error = {max_error:g})"
             )
-    crossed = self_crossings(values)
+    shapes = polygons(values)
+    crossed = self_crossings(values, shapes)
     if crossed:
         raise NumericalFailure(f"vesicle {crossed[0]} crosses itself")
-    pairs = pair_crossings(values)
+    pairs = pair_crossings(values, shapes)
     if pairs:
         raise NumericalFailure(f"vesicles {pairs[0][0]} and {pairs[0][1]} cross ({len(pairs)} pair(s) in all)")

@@ -113,6 +113,8 @@ def _history(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) ->
     axes[0].set_ylabel("bending energy")
     for name, label in (("area_error", "area"), ("length_error", "length")):
         axes[1].semilogy(time[1:], np.maximum(d[name][1:], 1e-17), label=label)
+    if d["error_estimate"].any():
+        axes[1].semilogy(time[1:], np.maximum(d["error_estimate"][1:], 1e-17), label="position (estimate)")
     axes[1].set_ylabel("relative error of a step,\nbefore correction")
     axes[1].legend(frameon=False)
     if trajectory.X.shape[1] > 1:

@@ -1,6 +1,7 @@
 """Trajectory files: every committed frame stays readable, whenever the writer is killed.
 
 out.h5: t (F,), step (F,), X (F, M, 2, N), sigma (F, M, N) where the solver has a tension, diagnostics/* (F,), attributes.
+dt, error_estimate and rejected came later: files without them are read as zeros.
 While a run is writing, new frames lie one file each in out.h5.frames/ and are merged into out.h5 from time to time and at the end;
 `read_trajectory` reads both. Every file appears by a rename after a sync.
 """
@@ -19,7 +20,8 @@ import numpy as np
 from biem.run.files import atomic_h5, one_line
 
 SCHEMA = 1
-DIAGNOSTICS = ("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap")
+REQUIRED = ("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap")
+DIAGNOSTICS = (*REQUIRED, "dt", "error_estimate", "rejected", "repulsion_work")
 MERGE_AT = 64  # loose frames, at least; more where the file is longer, so that merging costs a constant factor
 
 
@@ -28,7 +30,8 @@ class Trajectory:
     """Frames: t (F,), step (F,), X (F, M, 2, N), sigma (F, M, N) or None; diagnostics: name -> (F,).
 
     area_error and length_error are the largest relative errors of a step since the last frame, before correction; bending_energy is
-    the suspension's; gmres_iterations the most since the last frame; wall_seconds the mean of a step since then; min_gap is at t.
+    the suspension's; gmres_iterations the most since the last frame; wall_seconds the mean of a step since then; min_gap is at t; dt is
+    of the last step; error_estimate the worst since the last frame, zero where there is none; rejected the steps rejected since then.
     """
 
     t: np.ndarray
@@ -56,7 +59,7 @@ class Trajectory:
 
 def one_frame(t: float, step: int, X: np.ndarray, sigma: np.ndarray | None, diagnostics: Mapping[str, float]) -> Trajectory:
     """A trajectory of one frame."""
-    values = {name: np.array([diagnostics[name]], dtype=np.float64) for name in DIAGNOSTICS}
+    values = {name: np.array([diagnostics.get(name, 0.0)], dtype=np.float64) for name in DIAGNOSTICS}
     return Trajectory(np.array([t]), np.array([step]), X[None], None if sigma is None else sigma[None], values, {})
 
 
@@ -155,14 +158,15 @@ def _read(path: Path) -> Trajectory:
         raise FileNotFoundError(f"trajectory {path} does not exist")
     try:
         with h5py.File(path, "r") as file:
-            needed = ["t", "step", "X", *(f"diagnostics/{name}" for name in DIAGNOSTICS)]
+            needed = ["t", "step", "X", *(f"diagnostics/{name}" for name in REQUIRED)]
             missing = [name for name in needed if name not in file]
             if missing or file.attrs.get("schema") != SCHEMA:
                 lacks = f"it lacks {', '.join(missing)}" if missing else f"its schema is {file.attrs.get('schema')}"
                 raise ValueError(f"{path} is not a trajectory of schema {SCHEMA}: {lacks}")
             sigma = file["sigma"][:] if "sigma" in file else None
-            diagnostics = {name: file["diagnostics"][name][:] for name in DIAGNOSTICS}
-            return Trajectory(file["t"][:], file["step"][:], file["X"][:], sigma, diagnostics, dict(file.attrs))
+            t, stored = file["t"][:], file["diagnostics"]
+            diagnostics = {name: stored[name][:] if name in stored else np.zeros(len(t)) for name in DIAGNOSTICS}
+            return Trajectory(t, file["step"][:], file["X"][:], sigma, diagnostics, dict(file.attrs))
     except OSError as error:
         if not path.exists():
             raise FileNotFoundError(f"trajectory {path} does not exist") from None

@@ -8,38 +8,46 @@ import h5py
 import numpy as np
 
 from biem.curves.crossing import pair_crossings, polygons, self_crossings
-from biem.curves.curve import area, effective_radius, reduced_area
+from biem.curves.curve import area, effective_radius, length, reduced_area
 from biem.curves.fourier import remove_nyquist
 from biem.curves.packing import assemble, grid, random_packing
 from biem.curves.shapes import ellipse, equilibrium, perturbed
-from biem.scene.config import Scene, Vesicles, time_value
+from biem.scene.config import FLOAT32_TOLERANCE, Scene, Solver, Vesicles, time_value
 from biem.scene.flows import BackgroundFlow, capillary_factor, make_flow
 
 MOST_STEPS = 1e12
+LARGEST_SHRINKAGE = 1000.0  # of adaptive steps, from the first one
+LEAST_TOLERANCE = 1e-9  # of adaptive steps
 SHAPES = {"equilibrium": equilibrium, "ellipse": ellipse}
 
 
 @dataclass(frozen=True)
 class Problem:
-    """X (M, 2, N) at t = 0, the flow, dt and horizon in the scene's units; notices: what was changed in the input."""
+    """X (M, 2, N) at t = 0, the flow, dt, dt_min and horizon in the scene's units; notices: what was changed in the input."""
 
     scene: Scene
     X: np.ndarray
     flow: BackgroundFlow
     dt: float
+    dt_min: float
     horizon: float
     t_kappa: float
     notices: tuple[str, ...] = ()
 
     @property
     def steps(self) -> int:
-        """Steps to the horizon; the last one is shorter where dt does not divide it."""
+        """Steps of dt to the horizon; the last one is shorter where dt does not divide it."""
         return max(1, int(np.ceil(self.horizon / self.dt - 1e-9)))
 
     @property
     def radius(self) -> float:
         """R: radius of the circle of the vesicles' mean area."""
         return float(np.sqrt(np.mean(area(self.X)) / np.pi))
+
+    @property
+    def length(self) -> float:
+        """Mean length of the membranes."""
+        return float(np.mean(length(self.X)))
 
 
 def build(scene: Scene) -> Problem:
@@ -52,15 +60,53 @@ def build(scene: Scene) -> Problem:
         _check_rotation(X)
     t_kappa = scene.physics.mu * radius**3 / scene.physics.kappa_b
     units = {"t_gamma": flow.time_scale, "t_kappa": t_kappa}
-    dt = time_value(scene.time.dt, "dt", units)
-    horizon = time_value(scene.time.horizon, "horizon", units)
-    if not horizon / dt < MOST_STEPS:
-        raise ValueError(f"time.horizon is {horizon / dt:.3g} times time.dt: at most {MOST_STEPS:.0e} steps are made")
+    dt, dt_min, horizon = _times(scene, units)
     flow.velocity(X, 0.0)  # a custom flow shows here what is wrong with it
+    _check_solver(scene)
     points = scene.solver.operator_points
     if points is not None and points < X.shape[-1]:
         raise ValueError(f"solver.operator_points = {points} is below vesicles.points = {X.shape[-1]}: choose at least as many")
-    return Problem(scene, X, flow, dt, horizon, t_kappa, notices)
+    return Problem(scene, X, flow, dt, dt_min, horizon, t_kappa, notices)
+
+
+def _check_solver(scene: Scene) -> None:
+    """Options that the solver does not have, and tolerances that the precision does not give."""
+    solver = scene.solver
+    only = {"implicit": ("device", "dtype"), "split": ("tolerance", "max_iterations")}[solver.kind]
+    for key in only:
+        if getattr(solver, key) != Solver.model_fields[key].default:
+            other = "split" if solver.kind == "implicit" else "implicit"
+            raise ValueError(f'solver.{key} goes with solver.kind = "{other}"; remove it or choose that solver')
+    if solver.kind == "implicit" and solver.near_field.startswith("layers"):
+        raise ValueError(f'solver.near_field = "{solver.near_field}" goes with solver.kind = "split"; "implicit" takes "upsample"')
+    if solver.dtype == "float32":
+        for key in ("near_tolerance", "far_tolerance"):
+            value = getattr(solver, key)
+            if value is not None and value < FLOAT32_TOLERANCE:
+                raise ValueError(
+                    f'solver.{key} = {value:g} cannot be met in float32: choose at least {FLOAT32_TOLERANCE:g}, or dtype = "float64"'
+                )
+
+
+def _times(scene: Scene, units: dict[str, float | None]) -> tuple[float, float, float]:
+    """dt, dt_min, horizon."""
+    time = scene.time
+    dt = time_value(time.dt, "dt", units)
+    dt_min = dt / LARGEST_SHRINKAGE if time.dt_min is None else time_value(time.dt_min, "dt_min", units)
+    horizon = time_value(time.horizon, "horizon", units)
+    if not horizon / dt < MOST_STEPS:
+        raise ValueError(f"time.horizon is {horizon / dt:.3g} times time.dt: at most {MOST_STEPS:.0e} steps are made")
+    if time.adaptive:
+        if dt > horizon:
+            raise ValueError(f"time.dt = {dt:.6g}, the first step, is longer than time.horizon = {horizon:.6g}: choose a smaller one")
+        if dt_min > dt:
+            raise ValueError(f"time.dt_min = {dt_min:.6g} is above time.dt = {dt:.6g}, the first step: choose a smaller one")
+        if time.tolerance < LEAST_TOLERANCE:
+            raise ValueError(
+                f"time.tolerance = {time.tolerance:g} is below {LEAST_TOLERANCE:g}, where error estimates drown in the rounding and the "
+                "GMRES tolerance of a step: choose a larger one"
+            )
+    return dt, dt_min, horizon
 
 
 def _membranes(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:

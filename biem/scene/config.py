@@ -8,11 +8,12 @@ import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 Kind = Literal["quiescent", "shear", "extensional", "poiseuille", "taylor_green", "rotation", "custom"]
+FLOAT32_TOLERANCE = 1e-5  # the least that sums in float32 can be asked for
 Correction = Literal["redistribute", "area_length"]
 
 
@@ -60,25 +61,51 @@ class FlowTable(Table):
 
 
 class Time(Table):
-    """dt and horizon: numbers, or in units of the flow or of bending: "0.01 t_gamma", "2 t_kappa" (t_kappa = mu R^3 / kappa_b)."""
+    """dt, horizon and dt_min: numbers, or in units of the flow or of bending: "0.01 t_gamma", "2 t_kappa" (t_kappa = mu R^3 / kappa_b).
+
+    adaptive: dt is the first step, the next ones follow their errors; each step is made against two half steps, three times the work.
+    """
 
     dt: float | str
     horizon: float | str
     save_every: int = Field(1, ge=1)
     order: int = Field(1, ge=1, le=2)  # 2: each step against two half steps, locally extrapolated; three times the work
+    adaptive: bool = False
+    tolerance: float = Field(1e-3, gt=0, lt=1)  # adaptive: of a step's error in the membrane length, and in area and length, relative
+    dt_min: float | str | None = None  # adaptive: the run ends where it would take a smaller step; default dt/1000
+
+
+class RepulsionTable(Table):
+    """Repulsion between membranes closer than `reach` (in lengths), growing linearly to `strength` (in kappa_b/length^3) at contact."""
+
+    reach: float = Field(gt=0)
+    strength: float = Field(1e3, gt=0)
 
 
 class Solver(Table):
-    """The solver and what it is allowed to do."""
+    """The solver and what it is allowed to do. "implicit" runs in float64 on the CPU; "split" also on devices and in mixed precision."""
 
-    kind: Literal["implicit"] = "implicit"
-    tolerance: float = Field(1e-10, gt=0, lt=1)  # of GMRES, relative
-    max_iterations: int = Field(200, ge=1)
+    kind: Literal["implicit", "split"] = "implicit"
+    device: str = Field("cpu", pattern=r"^(cpu|torch|cuda(:\d+)?)$")  # split; "cpu": NumPy, "torch": PyTorch on the CPU, "cuda", "cuda:1"
+    dtype: Literal["float64", "float32"] = "float64"  # split; of kernels, solves and pair sums: geometry and forces are float64
+    tolerance: float = Field(1e-10, gt=0, lt=1)  # implicit: of GMRES, relative
+    max_iterations: int = Field(200, ge=1)  # implicit: of GMRES
     operator_points: int | None = Field(None, ge=16, multiple_of=2)
-    near_field: Literal["auto", "upsample", "ying_zorin", "none"] = "auto"
-    near_tolerance: float = Field(1e-8, gt=0, lt=1)
+    near_field: Literal["auto", "upsample", "ying_zorin", "layers", "layers_rbf", "none"] = "auto"
+    near_tolerance: float | None = Field(None, gt=0, lt=1)  # default 1e-8, split 1e-6, in float32 1e-5
+    far_field: Literal["auto", "direct", "ewald"] = "auto"
+    far_tolerance: float | None = Field(None, gt=0, lt=1)  # default 1e-10, split 1e-6, in float32 1e-5
+    repulsion: RepulsionTable | None = None
     corrections: list[Correction] = ["area_length", "redistribute"]
     max_error: float = Field(1e-2, gt=0)  # relative error of area or length in one step (since the start, if not corrected)
+
+    @property
+    def tolerances(self) -> tuple[float, float]:
+        """Of the near and of the far field."""
+        near, far = {"implicit": (1e-8, 1e-10), "split": (1e-6, 1e-6)}[self.kind]
+        if self.dtype == "float32":
+            near = far = FLOAT32_TOLERANCE
+        return self.near_tolerance or near, self.far_tolerance or far
 
 
 class Output(Table):
@@ -178,7 +205,8 @@ def _explain(error: Any) -> str:
     if error["type"] == "extra_forbidden":
         model: Any = Scene
         for part in error["loc"][:-1]:
-            model = model.model_fields[part].annotation
+            annotation = model.model_fields[part].annotation
+            model = next((a for a in get_args(annotation) if isinstance(a, type) and issubclass(a, Table)), annotation)
         known = list(model.model_fields)
         near = difflib.get_close_matches(str(error["loc"][-1]), known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else "the keys there are " + ", ".join(known)
@@ -187,7 +215,7 @@ def _explain(error: Any) -> str:
         return f"key {path} is missing"
     if error["type"] == "model_type":
         return f"{path} = {error['input']!r}: expected a table [{path}]"
-    if path.startswith(("time.dt.", "time.horizon.")):  # one line for the two types that a time may have
+    if path.startswith(("time.dt.", "time.horizon.", "time.dt_min.")):  # one line for the two types that a time may have
         path = path.rpartition(".")[0]
         return f'{path} = {error["input"]!r}: expected a positive, finite number or a number and a unit, as in "0.01 t_gamma"'
     return f"{path} = {error['input']!r}: {error['msg'][0].lower()}{error['msg'][1:]}"

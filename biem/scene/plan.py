@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from biem.backend import threads
 from biem.membrane.maps import operator_points
+from biem.membrane.resultants import CPU_CHUNK, DEVICE_CHUNK
 from biem.scene.build import Problem
+from biem.stokes.farfield import far_field_bytes, far_scheme
 from biem.stokes.near import near_width
+from biem.stokes.near_layers import METHODS
 from biem.stokes.single_layer import near_scheme
 
 
@@ -20,50 +26,89 @@ class Part:
 
 
 def required_parts(problem: Problem) -> list[Part]:
-    """The parts of the implicit solver for this scene, in the order in which a step uses them."""
+    """The parts of the solver for this scene, in the order in which a step uses them."""
     M = problem.X.shape[0]
-    solver, output = problem.scene.solver, problem.scene.output
-    many, flowing = M > 1, problem.flow.kind != "quiescent"
-    scheme = near_scheme(solver.near_field)
-    if not many:
-        near = Part("near field", False, "one vesicle")
-    elif scheme == "none":
-        near = Part("near field", False, 'solver.near_field = "none"')
-    else:
-        width = near_width(scheme, solver.near_tolerance)
-        near = Part("near field", True, f"{scheme}, on demand: where a membrane is within {width:.1f} h of another")
-    return [
+    solver, output, time = problem.scene.solver, problem.scene.output, problem.scene.time
+    many, flowing, split = M > 1, problem.flow.kind != "quiescent", solver.kind == "split"
+    moved = "the other vesicles" if many else "the flow"
+    parts = [
         Part("relaxation", True, "bending is implicit: one dense solve a vesicle"),
         Part("background flow", flowing, f"flow {problem.flow.kind}" if flowing else "the fluid is at rest"),
+    ]
+    if split:
+        needed = many or flowing
+        parts.append(Part("advection", needed, f"the velocity of {moved} is made inextensible" if needed else "nothing moves the vesicle"))
+    parts.append(
         Part(
             "tension",
             many or output.tension,
             "its force moves the other vesicles" if many else "asked for" if output.tension else "not asked for",
+        )
+    )
+    how = "explicit, two sums a step" if split else "GMRES over pair sums"
+    parts += [
+        Part("vesicle-vesicle coupling", many, f"{M} vesicles: {how}" if many else "one vesicle"),
+        _far_field(problem) if many else Part("far field", False, "one vesicle"),
+        _near_field(problem) if many else Part("near field", False, "one vesicle"),
+        Part(
+            "repulsion",
+            many and solver.repulsion is not None,
+            f"where a gap is below {solver.repulsion.reach:g} lengths" if solver.repulsion else "not asked for",
         ),
-        Part("vesicle-vesicle coupling", many, f"{M} vesicles: GMRES over pair sums" if many else "one vesicle"),
-        near,
         Part("area and length correction", "area_length" in solver.corrections, "solver.corrections"),
         Part("redistribution of nodes", "redistribute" in solver.corrections, "solver.corrections"),
-        Part("extrapolation", problem.scene.time.order == 2, f"time.order = {problem.scene.time.order}"),
+        Part("extrapolation", time.order == 2, f"time.order = {time.order}"),
+        Part("step size control", time.adaptive, f"time.tolerance = {time.tolerance:g}" if time.adaptive else "time.adaptive = false"),
         Part("walls", False, "none in the scene"),
     ]
+    return parts
+
+
+def _near_field(problem: Problem) -> Part:
+    solver = problem.scene.solver
+    layered = solver.near_field in METHODS
+    scheme = "upsample" if layered else near_scheme(solver.near_field)
+    if scheme == "none":
+        return Part("near field", False, 'solver.near_field = "none"')
+    where = f"{scheme}, on demand: where a membrane is within {near_width(scheme, solver.tolerances[0]):.1f} h of another"
+    return Part("near field", True, where + (f"; {solver.near_field} within 1 h" if layered else ""))
+
+
+def _far_field(problem: Problem) -> Part:
+    scheme = _scheme(problem)
+    tolerance = f", tolerance {problem.scene.solver.tolerances[1]:g}" if scheme == "ewald" else ""
+    return Part("far field", True, f"{scheme} sum of {problem.X.shape[0] * problem.X.shape[2]} points{tolerance}")
+
+
+def _scheme(problem: Problem) -> str:
+    M, _, N = problem.X.shape
+    solver = problem.scene.solver
+    return far_scheme(solver.far_field, M * N, M * N, solver.tolerances[1], solver.device.startswith("cuda"))
 
 
 def memory_estimate(problem: Problem) -> float:
-    """Bytes of the largest arrays held at once during a step (64-bit floats)."""
+    """Bytes of the largest arrays held at once during a step."""
     M, _, N = problem.X.shape
-    n = operator_points(N, problem.scene.solver.operator_points)
+    solver = problem.scene.solver
+    n = operator_points(N, solver.operator_points)
+    size = 4.0 if solver.dtype == "float32" else 8.0
+    near_pairs = M * N  # one close neighbour for every node
+    extent = np.ptp(problem.X, axis=(0, 2))
+    far = far_field_bytes(M * N, M, N, _scheme(problem), solver.tolerances[1], (float(extent[0]), float(extent[1]))) if M > 1 else 0.0
+    if solver.kind == "split":
+        chunk = min(M * n**2, threads() * CPU_CHUNK if solver.device in ("cpu", "torch") else DEVICE_CHUNK)
+        factors = size * M * n**2 if M > 1 or problem.flow.kind != "quiescent" else 0.0
+        return factors + 12 * 8.0 * chunk + 8.0 * (24 * M * 2 * n + 40 * M * 2 * N + 16 * near_pairs) + far
     one_chunk = 16 * (2 * n) ** 2  # operators of the vesicles in work
     if M == 1:
         return 8.0 * one_chunk
     response = M * (2 * N) * (5 * N)
     krylov = 2 * M * N * 40
-    near_rows = M * N * 4 * N  # one close neighbour for every node
-    return 8.0 * (2 * one_chunk + 2 * response + krylov + near_rows)
+    return 8.0 * (2 * one_chunk + 2 * response + krylov + near_pairs * 4 * N) + far
 
 
 def trajectory_bytes(problem: Problem) -> float:
-    """Size of the trajectory file."""
+    """Size of the trajectory file; of adaptive runs, if all steps are as long as the first one."""
     M, _, N = problem.X.shape
     frames = problem.steps // problem.scene.time.save_every + 2
     with_tension = M > 1 or problem.scene.output.tension

@@ -9,42 +9,63 @@ from dataclasses import dataclass, replace
 
 from array_api_compat import array_namespace
 
-from biem.backend import Array, count
+from biem.backend import Array, count, from_numpy, on_cpu, parallel_map, to_numpy
 from biem.curves.conserve import restore_area_length
 from biem.curves.curve import area, length
 from biem.curves.reparam import redistribute
+from biem.ranks import ALONE, Ranks
 from biem.steppers.stepper import State, Stepper, StepResult
 
 REDISTRIBUTE = "redistribute"
 AREA_LENGTH = "area_length"
+CHUNK = 256  # vesicles that one thread corrects at a time
 CORRECTIONS = (REDISTRIBUTE, AREA_LENGTH)
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """`inner`, then nodes redistributed to equal arclength, then area and length restored to area_0, length_0 (M,)."""
+    """`inner`, then nodes redistributed to equal arclength, then area and length restored to area_0, length_0 (M,).
+
+    What a solver predicts the coupling velocity from stays with its node: redistribution is part of a node's motion.
+    """
 
     inner: Stepper
     corrections: tuple[str, ...]
     area_0: Array
     length_0: Array
+    ranks: Ranks = ALONE
 
     def step(self, state: State, dt: float) -> StepResult:
         result = self.inner.step(state, dt)
         X, sigma = result.state.X, result.state.sigma
         xp = array_namespace(X)
+        area_0, length_0 = (from_numpy(to_numpy(a), like=X) for a in (self.area_0, self.length_0))
         diagnostics = dict(result.diagnostics)
-        for name, error in (("area", xp.abs(area(X) / self.area_0 - 1.0)), ("length", xp.abs(length(X) / self.length_0 - 1.0))):
+        for name, error in (("area", xp.abs(area(X) / area_0 - 1.0)), ("length", xp.abs(length(X) / length_0 - 1.0))):
             worst = int(xp.argmax(error))
             diagnostics[f"{name}_error"] = float(error[worst])
             diagnostics[f"{name}_error_vesicle"] = worst
-        if not bool(xp.all(xp.isfinite(X))):
-            return StepResult(result.state, diagnostics)  # nothing to correct: the guard rejects it
+        if not self.corrections or not bool(xp.all(xp.isfinite(X))):  # what is not finite is the guard's to reject
+            return StepResult(result.state, diagnostics)
+
+        def correct(which: slice) -> tuple[Array, int]:
+            """X and, where it is known, sigma, stacked; and how many areas and lengths were restored."""
+            Y, fields, restored = X[which], [] if sigma is None else [sigma[which]], 0
+            if REDISTRIBUTE in self.corrections:
+                Y, *fields = redistribute(Y, *fields, first=which.start)
+            if AREA_LENGTH in self.corrections:
+                Y, restored = restore_area_length(Y, area_0[which], length_0[which], first=which.start)
+            return xp.concat([Y, *(f[:, None, :] for f in fields)], axis=1), restored
+
+        def correct_all(mine: slice) -> tuple[Array, int]:
+            if not on_cpu(X):
+                return correct(mine)
+            parts = parallel_map(correct, [slice(i, min(i + CHUNK, mine.stop)) for i in range(mine.start, mine.stop, CHUNK)])
+            return xp.concat([part for part, _ in parts], axis=0), sum(restored for _, restored in parts)
+
+        both, restored = self.ranks.gather_all(X.shape[0], correct_all)
         if REDISTRIBUTE in self.corrections:
-            X, *fields = redistribute(X, *([] if sigma is None else [sigma]))
-            sigma = fields[0] if fields else None
             count("redistributed", X.shape[0])
         if AREA_LENGTH in self.corrections:
-            X, restored = restore_area_length(X, self.area_0, self.length_0)
-            count("area_length_restored", restored)
-        return StepResult(replace(result.state, X=X, sigma=sigma), diagnostics)
+            count("area_length_restored", sum(restored))
+        return StepResult(replace(result.state, X=both[:, :2], sigma=None if sigma is None else both[:, 2]), diagnostics)

@@ -13,23 +13,22 @@ velocity of the present forces, so a step depends on (X^n, sigma^n) alone. Paper
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from array_api_compat import array_namespace
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from biem.backend import Array, constant, count, from_numpy, one_blas_thread, parallel_map, to_numpy
-from biem.curves.curve import arclength_weights
 from biem.curves.fourier import read_back, read_back_matrix, resample, resampling_matrix
 from biem.errors import NumericalFailure
-from biem.membrane.maps import operator_points, relaxation_system
-from biem.membrane.operators import VesicleOperators, bending_force, membrane_force
+from biem.membrane.maps import operator_points
+from biem.membrane.operators import VesicleOperators, bending_force, membrane_force, relaxation_system
+from biem.membrane.repulsion import Repulsion, work_of
 from biem.steppers.stepper import Flow, State, StepResult
-from biem.stokes.farfield_direct import direct_sum
-from biem.stokes.near import apply_rows, near_correction, near_width
-from biem.stokes.near_search import NearPairs, find_near, minimum_gap
-from biem.stokes.single_layer import near_scheme
+from biem.stokes.interaction import DEFAULT_FIELDS, Fields, Interaction
+from biem.stokes.kress import on_own_curve
+from biem.stokes.near_search import minimum_gap
 
 CHUNK_VALUES = 1 << 16  # matrix entries per operator of one chunk of vesicles: they stay in the cache
 
@@ -38,8 +37,8 @@ CHUNK_VALUES = 1 << 16  # matrix entries per operator of one chunk of vesicles: 
 class ImplicitStepper:
     """Parameters of the step. flow: background velocity, or None in a fluid at rest.
 
-    points: nodes of the operators (default 2 N below N = 96); tolerance: GMRES, relative; near_tolerance: of the near field;
-    tension: keep sigma also where no other vesicle needs it.
+    points: nodes of the operators (default 2 N below N = 96); tolerance: GMRES, relative; tension: keep sigma also where no other vesicle
+    needs it. The repulsion is taken at X^n, as a background velocity.
     """
 
     kappa_b: float
@@ -48,8 +47,8 @@ class ImplicitStepper:
     points: int | None = None
     tolerance: float = 1e-10
     max_iterations: int = 200
-    near_field: str = "auto"
-    near_tolerance: float = 1e-8
+    fields: Fields = DEFAULT_FIELDS
+    repulsion: Repulsion | None = None
     tension: bool = False
 
     def step(self, state: State, dt: float) -> StepResult:
@@ -61,13 +60,17 @@ class ImplicitStepper:
         X = state.X
         u_inf = 0.0 * X if self.flow is None else self.flow(X, state.t)
         response = self._response(X, dt)
-        coupling = Coupling.build(X, self.mu, near_scheme(self.near_field), self.near_tolerance)
+        coupling = Interaction.build(X, self.mu, self.fields, stored=True)
+        repulsive = None if self.repulsion is None else self.repulsion.force(X)
+        if repulsive is not None:
+            u_inf = u_inf + on_own_curve(X, repulsive, self.mu) + coupling.velocity(repulsive)
 
         rhs = u_inf + coupling.velocity(response.force_0)
         guess = rhs if state.sigma is None else u_inf + coupling.velocity(membrane_force(X, state.sigma, self.kappa_b))
-        u, iterations = self._gmres(lambda v: v - coupling.velocity(response.force(v)), rhs, guess, coupling)
-        new = State(state.t + dt, X + response.increment(u), response.tension(u))
-        return StepResult(new, {"gmres_iterations": iterations})
+        u, iterations = self._gmres(lambda v: v - coupling.velocity(response.force(v)), rhs, guess, X)
+        increment = response.increment(u)
+        diagnostics = {"gmres_iterations": iterations, **work_of(repulsive, X, increment)}
+        return StepResult(State(state.t + dt, X + increment, response.tension(u)), diagnostics)
 
     def _step_alone(self, state: State, dt: float) -> StepResult:
         """One vesicle: no coupling, one solve; without flow, relaxation alone."""
@@ -128,7 +131,7 @@ class ImplicitStepper:
             force[..., 1:],
         )
 
-    def _gmres(self, apply: Callable[[Array], Array], rhs: Array, guess: Array, coupling: Coupling) -> tuple[Array, int]:
+    def _gmres(self, apply: Callable[[Array], Array], rhs: Array, guess: Array, X: Array) -> tuple[Array, int]:
         """u with apply(u) = rhs, and the iterations taken; the true residual is checked."""
         size = int(np.prod(rhs.shape))
         iterations = 0
@@ -156,7 +159,7 @@ class ImplicitStepper:
         if not residual <= 10.0 * self.tolerance:
             raise NumericalFailure(
                 f"GMRES stopped at a relative residual of {residual:.1e} (wanted {self.tolerance:.1e}) after {iterations} iterations, "
-                f"smallest gap between nodes and membranes {minimum_gap(coupling.X):.2e}: take smaller steps or more nodes"
+                f"smallest gap between nodes and membranes {minimum_gap(X):.2e}: take smaller steps or more nodes"
             )
         return from_numpy(solution.reshape(rhs.shape), like=rhs), iterations
 
@@ -188,39 +191,3 @@ class Response:
 def _apply(matrix: Array, u: Array, shape: tuple[int, ...]) -> Array:
     xp = array_namespace(u)
     return xp.reshape(xp.matmul(matrix, xp.reshape(u, (u.shape[0], -1, 1))), shape)
-
-
-@dataclass(frozen=True)
-class Coupling:
-    """Velocity of each vesicle due to all others, geometry fixed: pair sum plus near rows built once."""
-
-    X: Array
-    mu: float
-    weights: Array
-    targets: Array
-    owner: Array
-    pairs: NearPairs | None
-    rows: Array | None
-
-    @classmethod
-    def build(cls, X: Array, mu: float, scheme: str, tolerance: float) -> Coupling:
-        xp = array_namespace(X)
-        M, _, N = X.shape
-        targets = xp.reshape(xp.permute_dims(X, (0, 2, 1)), (M * N, 2))
-        owner = from_numpy(np.repeat(np.arange(M), N), like=X)
-        coupling = cls(X, mu, arclength_weights(X)[:, None, :], targets, owner, None, None)
-        if scheme == "none":
-            return coupling
-        pairs = find_near(X, targets, near_width(scheme, tolerance), owner)
-        if len(pairs) == 0:
-            return coupling
-        return replace(coupling, pairs=pairs, rows=near_correction(X, targets, pairs, mu, scheme, tolerance))
-
-    def velocity(self, f: Array) -> Array:
-        """(M, 2, N) for force densities f (M, 2, N)."""
-        xp = array_namespace(f)
-        M, _, N = f.shape
-        u = direct_sum(self.targets, self.X, f * self.weights, self.mu, self.owner)
-        if self.rows is not None and self.pairs is not None:
-            u = apply_rows(u, self.rows, self.pairs, f)
-        return xp.permute_dims(xp.reshape(u, (M, N, 2)), (0, 2, 1))

@@ -11,11 +11,16 @@ from biem.backend import Array
 
 @dataclass(frozen=True)
 class State:
-    """Membranes X (M, 2, N) at time t; sigma (M, N) is their tension, or None where nothing has asked for it."""
+    """Membranes X (M, 2, N) at time t; sigma (M, N) is their tension, or None where nothing has asked for it.
+
+    coupling: a time, the velocity (M, 2, N) that the vesicles then induced on each other, and its rate; a solver that takes this
+    velocity explicitly predicts it from there.
+    """
 
     t: float
     X: Array
     sigma: Array | None = None
+    coupling: tuple[float, Array, Array] | None = None
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ def near_width(scheme: str, tolerance: float) -> float:
 def near_correction(X: Array, targets: Array, pairs: NearPairs, mu: float, scheme: str, tolerance: float) -> Array:
     """Rows (Q, 2, 2, N): [accurate - trapezoid rule on the N nodes] velocity at the pair's target is rows . f of the pair's curve."""
     count("near_rows", len(pairs))
+    pairs = pairs.to_numpy()
     points = targets[from_numpy(pairs.target, like=targets)]
     rows = accurate_rows(X, points, pairs, mu, scheme, tolerance) - _trapezoid_rows(X, points, pairs.vesicle, X.shape[-1], mu)
     xp = array_namespace(X)
@@ -48,6 +49,7 @@ def near_correction(X: Array, targets: Array, pairs: NearPairs, mu: float, schem
 def apply_rows(u: Array, rows: Array, pairs: NearPairs, f: Array) -> Array:
     """u (P, 2) with rows . f added at the pairs' targets. f: (M, 2, N)."""
     xp = array_namespace(u)
+    pairs = pairs.to_numpy()
     f_pair = f[from_numpy(pairs.vesicle, like=f)]
     values = xp.sum(rows * f_pair[:, None, :, :], axis=(-2, -1))
     return scatter_add(u, from_numpy(pairs.target, like=u), values)
@@ -59,20 +61,26 @@ def accurate_rows(X: Array, points: Array, pairs: NearPairs, mu: float, scheme: 
         return _ying_zorin_rows(X, points, pairs, mu)
     xp = array_namespace(X)
     N = X.shape[-1]
-    digits = log(1.0 / tolerance)
     rows = xp.zeros((len(pairs), 3, N), dtype=X.dtype, device=X.device)
-    todo = np.ones(len(pairs), dtype=bool)
+    factor = upsampling(pairs.rho, N, tolerance)
     for level in LEVELS:
-        here = todo & ((level - 0.25) * N * pairs.rho >= digits)
-        if here.any():
-            index = np.flatnonzero(here)
+        index = np.flatnonzero(factor == level)
+        if len(index):
             rows[from_numpy(index, like=X)] = _trapezoid_rows(X, points[from_numpy(index, like=X)], pairs.vesicle[index], level * N, mu)
-        todo &= ~here
-    if todo.any():
-        index = np.flatnonzero(todo)
+    index = np.flatnonzero(factor == 0)
+    if len(index):
         index = index[np.argsort(pairs.rho[index])]  # neighbours in a chunk share their panels
         rows[from_numpy(index, like=X)] = _graded_rows(X, points[from_numpy(index, like=X)], pairs.subset(index), mu)
     return rows
+
+
+def upsampling(rho: Array, N: int, tolerance: float) -> Array:
+    """The smallest of LEVELS (Q,) that resolves pairs of resolution rho (Q,); 0 where none does."""
+    xp = array_namespace(rho)
+    factor = xp.zeros_like(rho, dtype=xp.int64)
+    for level in reversed(LEVELS):
+        factor = xp.where((level - 0.25) * N * rho >= log(1.0 / tolerance), xp.full_like(factor, level), factor)
+    return factor
 
 
 def layer_values(X: Array, f: Array, points: Array, mu: float, tolerance: float = 1e-9) -> Array:
@@ -83,7 +91,8 @@ def layer_values(X: Array, f: Array, points: Array, mu: float, tolerance: float 
     vesicle = np.repeat(np.arange(M), Q)
     x, nodes = to_numpy(points), to_numpy(X).transpose(0, 2, 1)
     nearest = np.argmin(((x[:, :, None, :] - nodes[:, None, :, :]) ** 2).sum(-1), axis=-1).ravel()
-    pairs = locate(X, flat, np.arange(M * Q), vesicle, 2 * pi * nearest / X.shape[-1])
+    start = (np.arange(M * Q), vesicle, 2 * pi * nearest / X.shape[-1])
+    pairs = locate(X, flat, *(from_numpy(a, like=X) for a in start)).to_numpy()
     rows = accurate_rows(X, flat, pairs, mu, "upsample", tolerance)
     rows = xp.stack([rows[:, (0, 1), :], rows[:, (1, 2), :]], axis=1)
     return xp.reshape(xp.sum(rows * f[from_numpy(vesicle, like=X)][:, None], axis=(-2, -1)), (M, Q, 2))

@@ -17,7 +17,8 @@ def test_importing_biem_and_all_its_modules_does_not_import_torch():
     code = """
 import importlib, pkgutil, sys, biem
 for module in pkgutil.walk_packages(biem.__path__, "biem."):
-    importlib.import_module(module.name)
+    if module.name != "biem.stokes.farfield_triton":  # for CUDA tensors alone
+        importlib.import_module(module.name)
 assert "biem.stokes.near" in sys.modules
 assert "torch" not in sys.modules
 """

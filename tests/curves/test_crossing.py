@@ -92,6 +92,19 @@ def test_one_curve_has_no_pairs_and_tensors_are_accepted():
     assert self_crossings(X) == []
 
 
+def test_one_crossing_pair_and_one_self_crossing_among_2000():
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.arange(50.0), np.arange(40.0)), axis=-1).reshape(-1, 2)
+    one = equilibrium(32, 0.65)  # 0.42 long
+    X = np.stack([place(one, 0.45 * c, a) for c, a in zip(grid, rng.uniform(0, 2 * np.pi, len(grid)), strict=True)])
+    assert (self_crossings(X), pair_crossings(X)) == ([], [])
+    X[700] = figure_eight(32) * 0.15 + X[700].mean(axis=-1, keepdims=True)
+    X[1234] += 0.7 * (X[1235] - X[1234]).mean(axis=-1, keepdims=True)
+    assert self_crossings(X) == [700]
+    assert pair_crossings(X) == [(1234, 1235)]
+    assert (self_crossings(X, polygons(X)), pair_crossings(X, polygons(X))) == ([700], [(1234, 1235)])
+
+
 def test_polygons_run_through_the_refined_curve():
     P = polygons(circle(32)[None], 8)[0]
     n = 8 * 32

@@ -91,7 +91,7 @@ def test_near_layers_are_the_single_layer_there():
     fine, f_fine = resample(X, 1024), waves(3, resample(X, 1024))
     h = length(X)[:, None, None] / 64
     for m in range(2):
-        on_curve = ExactMaps(mu=2.0).operators(X).S[m] @ resample(f, 128)[m].reshape(-1)
+        on_curve = VesicleOperators(resample(X, 128), mu=2.0).S[m] @ resample(f, 128)[m].reshape(-1)
         assert np.allclose(u[m, 2], on_curve.reshape(2, 128)[:, ::2], atol=1e-7)
         for k, offset in enumerate(LAYERS):
             if offset:

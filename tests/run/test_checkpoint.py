@@ -7,6 +7,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from biem.run.checkpoint import Checkpoint, checkpoint_path, read_checkpoint, remove_checkpoints, write_checkpoint
 from biem.steppers.stepper import State
@@ -14,13 +15,17 @@ from biem.steppers.stepper import State
 
 def make(step, tension=True):
     rng = np.random.default_rng(step)
-    state = State(step / 3.0, rng.normal(size=(2, 2, 16)), rng.normal(size=(2, 16)) if tension else None)
+    sigma, *vectors = rng.normal(size=(2, 16)), *rng.normal(size=(3, 2, 2, 16))
+    state = State(step / 3.0, vectors[0], sigma if tension else None, (step / 4.0, *vectors[1:]) if tension else None)
     area_0, length_0 = rng.uniform(size=(2, 2))
-    return Checkpoint(step, state, area_0, length_0, '{"name": "x"}', {"seconds": 0.1 * step}, {"pair_sum": step})
+    return Checkpoint(step, state, area_0, length_0, '{"name": "x"}', {"seconds": 0.1 * step}, {"pair_sum": step}, "", {"dt": 0.1 / step})
 
 
 def assert_same(a, b):
-    assert (a.step, a.state.t, a.scene, a.running, a.counts) == (b.step, b.state.t, b.scene, b.running, b.counts)
+    names = ("step", "scene", "running", "counts", "run", "control")
+    assert [a.state.t, *(getattr(a, n) for n in names)] == [b.state.t, *(getattr(b, n) for n in names)]
+    assert (a.state.coupling is None) == (b.state.coupling is None)
+    assert a.state.coupling is None or all(np.array_equal(p, q) for p, q in zip(a.state.coupling, b.state.coupling, strict=True))
     pairs = [(a.state.X, b.state.X), (a.area_0, b.area_0), (a.length_0, b.length_0), (a.state.sigma, b.state.sigma)]
     assert all((p is None and q is None) or np.array_equal(p, q) for p, q in pairs)
 
@@ -63,7 +68,21 @@ def test_file_that_lacks_something_falls_back_too(path):
         assert_same(read_checkpoint(path), make(1))
 
 
-@pytest.mark.parametrize("where", ["X", "sigma", "t"])
+def test_a_checkpoint_of_before_adaptive_steps_is_read(path):
+    write_checkpoint(path, make(5))
+    with h5py.File(path, "a") as file:
+        del file["control"]
+    assert_same(read_checkpoint(path), replace(make(5), control={}))
+
+
+def test_tensors_are_written_as_the_arrays_that_they_are(path):
+    whole = make(5)
+    state = replace(whole.state, X=torch.from_numpy(whole.state.X), sigma=torch.from_numpy(whole.state.sigma))
+    write_checkpoint(path, replace(whole, state=state))
+    assert_same(read_checkpoint(path), whole)
+
+
+@pytest.mark.parametrize("where", ["X", "sigma", "coupling", "t"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_state_that_is_not_finite_is_refused_and_the_old_one_left(path, where, value):
     for step in (1, 2):
@@ -73,7 +92,7 @@ def test_a_state_that_is_not_finite_is_refused_and_the_old_one_left(path, where,
     if where == "t":
         bad = replace(bad, state=replace(bad.state, t=value))
     else:
-        getattr(bad.state, where)[1, ..., 3] = value
+        {"X": bad.state.X, "sigma": bad.state.sigma, "coupling": bad.state.coupling[2]}[where][1, ..., 3] = value
     with pytest.raises(ValueError, match="step 3 is not finite"):
         write_checkpoint(path, bad)
     assert {p.name: p.read_bytes() for p in path.parent.iterdir()} == before

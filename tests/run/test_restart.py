@@ -1,6 +1,7 @@
 """Restarts: a run that was stopped and resumed is, bit for bit, the run that was not; what does not fit is refused."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -88,6 +89,26 @@ def test_stopped_means_that_its_checkpoint_is_written(tmp_path, monkeypatch, loo
     with pytest.raises(Stopped) as caught:
         simulate(scene_of(time={"save_every": 100}), tmp_path / "out.h5")
     assert f"step {read_checkpoint(checkpoint_path(tmp_path / 'out.h5')).step} of" in str(caught.value)
+
+
+def test_what_a_solver_keeps_of_the_step_before_survives_a_restart(tmp_path, monkeypatch):
+    make = loop.make_stepper
+
+    class Remembering:
+        def __init__(self, *arguments):
+            self.inner = make(*arguments)
+
+        def step(self, state, dt):
+            new = self.inner.step(state, dt)
+            t, u, rate = (state.t, 0.0 * state.X, 0.0 * state.X) if state.coupling is None else state.coupling
+            drift = 1e-3 * (u + (state.t - t) * rate).mean()
+            return replace(new, state=replace(new.state, X=new.state.X + drift, coupling=(state.t, state.X, state.X - u)))
+
+    monkeypatch.setattr(loop, "make_stepper", Remembering)
+    whole = simulate(until(6, PAIR)).trajectory
+    simulate(until(3, PAIR), tmp_path / "out.h5")
+    assert read_checkpoint(checkpoint_path(tmp_path / "out.h5")).state.coupling[0] == 2 * DT
+    assert_same_frames(simulate(until(6, PAIR), tmp_path / "out.h5", resume=True).trajectory, whole)
 
 
 def test_truncated_checkpoint_resumes_from_the_previous_one(tmp_path):

@@ -13,7 +13,8 @@ from biem.run import trajectory as module
 from biem.run.simulate import simulate
 from biem.run.trajectory import TrajectoryWriter, exists, join, one_frame, read_trajectory
 
-NAMES = ("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap")
+OLD_NAMES = ("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap")
+NAMES = (*OLD_NAMES, "dt", "error_estimate", "rejected", "repulsion_work")
 
 
 def frame(k, tension=True):
@@ -133,6 +134,19 @@ def test_one_vesicle_has_no_tension_unless_asked(tmp_path):
 
 def test_until_keeps_the_frames_to_a_step():
     assert_same_frames(frames(6).until(3), frames(4))
+
+
+def test_a_file_without_the_later_diagnostics_reads_them_as_zeros(tmp_path, writer):
+    writer.append(frame(1))
+    writer.close()
+    with h5py.File(tmp_path / "out.h5", "a") as file:
+        for name in set(NAMES) - set(OLD_NAMES):
+            del file["diagnostics"][name]
+    old = read_trajectory(tmp_path / "out.h5")
+    assert_same_frames(old, frames(2))
+    for name in OLD_NAMES:
+        assert np.array_equal(old.diagnostics[name], frames(2).diagnostics[name])
+    assert all(old.diagnostics[name].tolist() == [0.0, 0.0] for name in set(NAMES) - set(OLD_NAMES))
 
 
 def spoiled(whole, name, path):

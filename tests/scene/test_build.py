@@ -7,7 +7,7 @@ from scene_helpers import scene_of, table
 
 from biem.curves.curve import area
 from biem.run.simulate import simulate
-from biem.run.trajectory import TrajectoryWriter, one_frame, read_trajectory
+from biem.run.trajectory import DIAGNOSTICS, TrajectoryWriter, one_frame, read_trajectory
 from biem.scene.build import build
 from biem.scene.config import make_scene
 
@@ -104,7 +104,7 @@ def test_a_trajectory_gives_its_last_frame(tmp_path):
 
 def test_a_trajectory_of_a_killed_run_gives_its_last_frame_too(tmp_path):
     shapes = [ellipses() + 0.1 * k for k in range(3)]
-    numbers = dict.fromkeys(("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap"), 0.0)
+    numbers = dict.fromkeys(DIAGNOSTICS, 0.0)
     writer = TrajectoryWriter(tmp_path / "killed.h5", {"schema": 1}, [one_frame(0.0, 0, shapes[0], None, numbers)])
     for k in (1, 2):
         writer.append(one_frame(0.1 * k, k, shapes[k], None, numbers))

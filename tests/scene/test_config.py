@@ -42,12 +42,21 @@ REFUSED = {
     "time.horizon": '0 | -1.0 | "inf t_kappa" | inf',
     "time.save_every": "0 | 2.5",
     "time.order": "0 | 3 | true",
+    "time.adaptive": '1 | "yes"',
+    "time.tolerance": '0 | -1e-3 | 1.0 | nan | "1e-3 t_gamma"',
+    "time.dt_min": '0 | -1e-6 | inf | true | [1] | "1e-4 furlongs" | ""',
     "solver.kind": '"exact"',
     "solver.tolerance": "0 | 1",
     "solver.max_iterations": "0",
     "solver.operator_points": "8 | 33",
     "solver.near_field": '"far"',
     "solver.near_tolerance": "-1e-8 | nan",
+    "solver.device": '"gpu" | "cuda:x" | 0',
+    "solver.dtype": '"float16" | 32',
+    "solver.far_field": '"fmm"',
+    "solver.far_tolerance": "0 | 1 | nan",
+    "solver.repulsion.reach": '0 | -1 | "near"',
+    "solver.repulsion.strength": "0 | nan",
     "solver.corrections": '["areas"] | "area_length"',
     "solver.max_error": "0 | nan",
     "output.trajectory": "5",
@@ -99,6 +108,29 @@ def test_unknown_tables_and_keys_far_from_any_name(tmp_path):
 
 def test_where_a_scene_lies_is_no_key_of_it(tmp_path):
     assert "unknown key folder" in refusal(write_scene(tmp_path), 'folder="elsewhere"')
+
+
+ADAPTIVE = {
+    "time.dt longer than the horizon": ({"dt": 2.0, "horizon": 1.0}, ["time.dt = 2", "time.horizon = 1"]),
+    "time.dt_min above dt": ({"dt": 0.1, "dt_min": "0.2", "horizon": 1.0}, ["time.dt_min = 0.2", "time.dt = 0.1"]),
+    "time.tolerance below precision": ({"dt": 0.1, "horizon": 1.0, "tolerance": 1e-10}, ["time.tolerance = 1e-10", "1e-09", "rounding"]),
+}
+
+
+@pytest.mark.parametrize("case", ADAPTIVE)
+def test_adaptive_times_that_contradict_each_other_are_refused_in_one_line(case):
+    time, fragments = ADAPTIVE[case]
+    with pytest.raises(ValueError) as caught:
+        build(scene_of(time={**time, "adaptive": True}))
+    assert all(fragment in str(caught.value) for fragment in fragments), str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert build(scene_of(time=time)).dt == time["dt"]  # equal steps care for none of it
+
+
+def test_dt_min_has_units_and_is_a_thousandth_of_dt():
+    time = {"dt": "0.01 t_gamma", "adaptive": True}
+    assert build(scene_of(time=time)).dt_min == pytest.approx(1e-7, rel=1e-12)
+    assert build(scene_of(time={**time, "dt_min": "1e-4 t_gamma"})).dt_min == pytest.approx(1e-6, rel=1e-12)
 
 
 @pytest.mark.parametrize("missing", ["time.dt", "time.horizon"])

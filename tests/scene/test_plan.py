@@ -86,6 +86,18 @@ def test_plan_prints_sizes_and_times(tmp_path):
     assert "time:" not in cli("plan", path, "--no-measure").output
 
 
+def test_plan_of_adaptive_steps_prices_the_first_dt(tmp_path):
+    path = write_scene(tmp_path, PAIR, time={"dt": "0.01 t_gamma", "horizon": "0.3 t_gamma", "adaptive": True, "tolerance": 1e-4})
+    out = cli("plan", path).output
+    assert "number not known, the first one of dt = 0.0001 (0.01 t_gamma) to 0.3 t_gamma" in out
+    assert re.search(r"yes  step size control +time\.tolerance = 0\.0001", out)
+    assert "if all are as long as the first one" in out
+    assert "30 steps" not in out
+    problem = build(scene_of(PAIR, time={"dt": "0.01 t_gamma", "horizon": "0.3 t_gamma", "adaptive": True}))
+    assert trajectory_bytes(problem) == trajectory_bytes(build(scene_of(PAIR, time={"dt": "0.01 t_gamma", "horizon": "0.3 t_gamma"})))
+    assert " -   step size control" in cli("plan", path, "--no-measure", "--set", "time.adaptive=false").output
+
+
 def test_estimates_follow_what_is_there():
     done = simulate(scene_of(PAIR, time={"horizon": 30 * DT, "save_every": 2})).trajectory
     problem = build(scene_of(PAIR, time={"horizon": 30 * DT, "save_every": 2}))

@@ -15,6 +15,7 @@ from biem.membrane.operators import VesicleOperators, membrane_force
 from biem.steppers.corrections import CORRECTIONS, Corrected
 from biem.steppers.implicit import ImplicitStepper
 from biem.steppers.stepper import State
+from biem.stokes.interaction import Fields
 from biem.stokes.kernels import stokeslet
 
 
@@ -89,7 +90,7 @@ def test_the_step_solves_the_coupled_equations():
 
 def test_alone_is_relaxation_and_far_apart_is_alone():
     X = pair(32)
-    assert np.array_equal(run(X[:1], None, 1e-5, 1, corrected=False).X, ExactMaps().relax(X[:1], 1e-5))
+    assert np.abs(run(X[:1], None, 1e-5, 1, corrected=False).X - ExactMaps().relax(X[:1], 1e-5)).max() < 1e-7  # of two quadratures
     far = X + np.array([0.0, 1e4])[:, None, None] * np.array([1.0, 0.0])[:, None]
     apart = run(far, None, 1e-5, 2, corrected=False).X - (far - X)
     for m in range(2):
@@ -187,8 +188,8 @@ def test_near_field_matters_and_is_on_demand():
         run(apart, None, 1e-5, 1, corrected=False)
     assert close["near_rows"] > 0
     assert distant["near_rows"] == 0
-    rough = run(X, None, 1e-5, 1, corrected=False, near_field="none").X
-    better = run(X, None, 1e-5, 1, corrected=False, near_field="ying_zorin").X
+    rough = run(X, None, 1e-5, 1, corrected=False, fields=Fields(near_field="none")).X
+    better = run(X, None, 1e-5, 1, corrected=False, fields=Fields(near_field="ying_zorin")).X
     assert np.abs(better - exact).max() < np.abs(rough - exact).max()
 
 

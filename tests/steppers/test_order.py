@@ -51,6 +51,29 @@ def test_estimate_is_the_error_of_two_half_steps():
     assert result.diagnostics["gmres_iterations"] > 0
 
 
+def test_first_order_keeps_the_two_half_steps():
+    X = pair()
+    inner, t_gamma = in_shear(X)
+    dt = 0.02 * t_gamma
+    result = Extrapolated(inner, order=1).step(State(0.0, X), dt)
+    half = inner.step(inner.step(State(0.0, X), dt / 2).state, dt / 2)
+    assert np.array_equal(result.state.X, half.state.X)
+    assert np.array_equal(result.state.sigma, half.state.sigma)
+    assert result.diagnostics["error_estimate"] == Extrapolated(inner).step(State(0.0, X), dt).diagnostics["error_estimate"]
+
+
+def test_changes_of_area_and_length_are_those_of_the_step():
+    class Growing:
+        def step(self, state, dt):
+            factor = np.array([1.0, 1.0 + dt])[:, None, None]
+            return StepResult(replace(state, X=state.X * factor), {"seen": dt} if dt < 0.1 else {})
+
+    diagnostics = Extrapolated(Growing(), order=1).step(State(0.0, pair()), 0.1).diagnostics
+    assert diagnostics["length_change"] == pytest.approx(1.05**2 - 1)
+    assert diagnostics["area_change"] == pytest.approx(1.05**4 - 1)
+    assert diagnostics["seen"] == 0.05  # what only some of the steps report
+
+
 def test_exact_for_a_linear_equation_of_second_degree():
     """A first-order stepper for x' = t (explicit Euler) becomes exact: x = t^2 / 2."""
 

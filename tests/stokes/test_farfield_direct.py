@@ -7,7 +7,7 @@ from helpers import rotate
 
 from biem.backend import counting
 from biem.stokes import farfield_direct
-from biem.stokes.farfield_direct import direct_sum
+from biem.stokes.farfield_direct import DirectSum, chunked_sum, direct_sum, own_sum, own_sum_of_arrays
 from biem.stokes.kernels import stokeslet
 
 
@@ -94,14 +94,36 @@ def test_any_memory_layout_and_order_of_targets():
 
 @pytest.mark.parametrize("chunk", [1 << 20, 1000, 1])
 @pytest.mark.parametrize("skip", [False, True])
-def test_torch_equals_numpy_whatever_the_chunks(monkeypatch, chunk, skip):
+def test_chunked_sum_of_tensors_equals_the_loop(monkeypatch, chunk, skip):
     monkeypatch.setattr(farfield_direct, "CHUNK", chunk)
     targets, X, g = case()
-    exclude = np.arange(len(targets)) % 5 - 1 if skip else None
+    targets[7] = X[2, :, 5]
+    exclude = np.arange(len(targets)) % 5 - 1 if skip else np.full(len(targets), -1)
+    tensors = [torch.from_numpy(a) for a in (targets, X, g, exclude)]
     u = direct_sum(targets, X, g, 0.7, exclude)
-    tensors = map(torch.from_numpy, (targets, X, g))
-    v = direct_sum(*tensors, 0.7, torch.from_numpy(exclude) if skip else None).numpy()
-    assert np.abs(v - u).max() < 1e-12 * np.abs(u).max()
+    for v in (direct_sum(*tensors[:3], 0.7, tensors[3]), chunked_sum(*tensors, 0.7)):
+        assert np.abs(v.numpy() - u).max() < 1e-12 * np.abs(u).max()
+    own = own_sum(targets, X, g, exclude, 0.7)
+    assert np.abs(direct_sum(targets, X, g, 0.7) - u - own).max() < 1e-12 * np.abs(u).max()
+    assert np.abs(own_sum_of_arrays(*tensors, 0.7).numpy() - own).max() < 1e-12 * np.abs(u).max()
+
+
+def test_sum_for_fixed_points_equals_the_sum():
+    targets, X, g = case()
+    fixed = DirectSum(targets, X, 0.7)
+    for f in (g, 2.0 * g):
+        assert (fixed.velocity(f) == direct_sum(targets, X, f, 0.7)).all()
+
+
+@pytest.mark.parametrize("convert", [lambda a: a, torch.from_numpy, lambda a: a.astype(np.float32)])
+def test_what_is_not_a_number_stays_so_and_where_it_is(convert):
+    targets, X, g = case()
+    targets[3, 0] = np.nan
+    u = np.asarray(direct_sum(*map(convert, (targets, X, g)), 1.0))
+    assert np.isnan(u[3]).all()
+    assert np.isfinite(np.delete(u, 3, axis=0)).all()
+    g[2, 1, 4] = np.nan
+    assert np.isnan(np.asarray(direct_sum(*map(convert, (targets, X, g)), 1.0))).all()
 
 
 @pytest.mark.parametrize("convert", [lambda a: a.astype(np.float32), lambda a: torch.from_numpy(a).to(torch.float32)])

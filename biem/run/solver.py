@@ -1,0 +1,126 @@
+"""From a problem to its stepper: the solver that the scene names, on its device, with extrapolation and corrections around it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from biem.membrane.maps import LAYERS, ExactMaps
+from biem.membrane.repulsion import Repulsion
+from biem.ranks import ALONE, Ranks
+from biem.scene.build import Problem
+from biem.scene.config import Scene
+from biem.scene.plan import memory_estimate
+from biem.steppers.corrections import Corrected
+from biem.steppers.implicit import ImplicitStepper
+from biem.steppers.order import Extrapolated
+from biem.steppers.split import SplitStepper
+from biem.steppers.stepper import Flow, State, Stepper
+from biem.stokes.interaction import Fields
+
+
+def check_machine(problem: Problem, ranks: Ranks = ALONE) -> None:
+    """Raises ValueError, before the first step, for a device, a library or memory that this machine does not have."""
+    name = problem.scene.solver.device
+    if name != "cpu" and find_spec("torch") is None:
+        raise ValueError(f'solver.device = "{name}" needs PyTorch: pip install torch, or take "cpu"')
+    if name.startswith("cuda"):
+        import torch
+
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        number = int(name.partition(":")[2] or 0)
+        if number >= count:
+            raise ValueError(f'solver.device = "{name}": this machine has {count} CUDA device(s) that PyTorch can use; take "cpu"')
+        free = float(torch.cuda.mem_get_info(ranks.rank % count)[0])
+    else:
+        free = _free_memory()
+    needed = memory_estimate(problem)
+    if needed > free:
+        M, _, N = problem.X.shape
+        raise ValueError(
+            f"a step of {M} vesicles of {N} nodes needs about {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free: take fewer "
+            'vesicles or nodes, solver.kind = "split", or more machines'
+        )
+
+
+def _free_memory() -> float:
+    """Bytes of memory that a process can still have."""
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        if line.startswith("MemAvailable"):
+            return 1024.0 * float(line.split()[1])
+    return float("inf")
+
+
+def make_stepper(problem: Problem, area_0: np.ndarray, length_0: np.ndarray, ranks: Ranks = ALONE) -> Stepper:
+    """The stepper that the scene asks for, with its corrections. Raises ValueError for what the processes cannot do."""
+    scene = problem.scene
+    M = problem.X.shape[0]
+    check_machine(problem, ranks)
+    if ranks.size > M:
+        raise ValueError(f"{ranks.size} processes for {M} vesicle(s): start at most as many processes as vesicles")
+    if ranks.size > 1 and scene.solver.kind == "implicit":
+        raise ValueError('solver.kind = "implicit" runs in one process: leave out mpirun, or take solver.kind = "split"')
+    inner = _split(problem, ranks) if scene.solver.kind == "split" else _implicit(problem)
+    if scene.time.order == 2 or scene.time.adaptive:
+        inner = Extrapolated(inner, scene.time.order)
+    return Corrected(inner, tuple(scene.solver.corrections), area_0, length_0, ranks)
+
+
+def on_device(state: State, scene: Scene, ranks: Ranks = ALONE) -> State:
+    """A state of NumPy arrays as arrays of the scene's device; with several devices, one a rank."""
+    name = scene.solver.device
+    if name == "cpu":
+        return state
+    import torch
+
+    if name == "torch":
+        name = "cpu"
+    elif ":" not in name:
+        name = f"cuda:{ranks.rank % max(1, torch.cuda.device_count())}"
+    move = lambda a: torch.as_tensor(a, device=name)
+    coupling = None if state.coupling is None else (state.coupling[0], move(state.coupling[1]), move(state.coupling[2]))
+    return replace(state, X=move(state.X), sigma=None if state.sigma is None else move(state.sigma), coupling=coupling)
+
+
+def _implicit(problem: Problem) -> Stepper:
+    physics, solver = problem.scene.physics, problem.scene.solver
+    return ImplicitStepper(
+        physics.kappa_b,
+        physics.mu,
+        _flow(problem),
+        solver.operator_points,
+        solver.tolerance,
+        solver.max_iterations,
+        _fields(problem.scene),
+        _repulsion(problem),
+        problem.scene.output.tension,
+    )
+
+
+def _split(problem: Problem, ranks: Ranks) -> Stepper:
+    scene = problem.scene
+    physics, solver = scene.physics, scene.solver
+    maps = ExactMaps(physics.kappa_b, physics.mu, solver.operator_points, solver.dtype)
+    fields = replace(_fields(scene), precision=solver.dtype, layers=maps.near_layers, offsets=LAYERS)
+    return SplitStepper(maps, physics.kappa_b, physics.mu, _flow(problem), fields, _repulsion(problem), scene.output.tension, ranks)
+
+
+def _fields(scene: Scene) -> Fields:
+    near, far = scene.solver.tolerances
+    return Fields(scene.solver.near_field, near, scene.solver.far_field, far)
+
+
+def _flow(problem: Problem) -> Flow | None:
+    return None if problem.flow.kind == "quiescent" else problem.flow.velocity
+
+
+def _repulsion(problem: Problem) -> Repulsion | None:
+    """Reach and strength from the unit of the scene's mean membrane length to that of X."""
+    table = problem.scene.solver.repulsion
+    if table is None:
+        return None
+    length = problem.length
+    return Repulsion(table.reach * length, table.strength * problem.scene.physics.kappa_b / length**3)

@@ -1,0 +1,113 @@
+"""Velocity of vesicles due to all others, on their own nodes: pair sum plus near-field correction, for a fixed geometry. X: (M, 2, N)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from array_api_compat import array_namespace
+
+from biem.backend import Array, from_numpy, to_numpy
+from biem.curves.curve import arclength_weights, length
+from biem.stokes.farfield import PairSum, pair_sum
+from biem.stokes.near import apply_rows, near_correction, near_width
+from biem.stokes.near_layers import METHODS, NearLayers
+from biem.stokes.near_search import NearPairs, find_near
+from biem.stokes.near_sums import NearSums
+from biem.stokes.single_layer import near_scheme
+
+
+@dataclass(frozen=True)
+class Fields:
+    """How near and far fields are evaluated, and to which tolerance (relative). layers: the map S[X, f] on `offsets`, for near layers."""
+
+    near_field: str = "auto"
+    near_tolerance: float = 1e-8
+    far_field: str = "auto"
+    far_tolerance: float = 1e-10
+    precision: str = "float64"  # of the pair sum
+    layers: Callable[[Array, Array], Array] | None = None
+    offsets: tuple[float, ...] = ()
+
+
+DEFAULT_FIELDS = Fields()
+
+
+class Correction(Protocol):
+    """What near targets get on top of the pair sum."""
+
+    def add(self, u: Array, f: Array) -> Array:
+        """u (P, 2) with the correction for force densities f (M, 2, N)."""
+        ...
+
+
+@dataclass(frozen=True)
+class NearRows:
+    """The correction as stored rows, for many forces on one geometry."""
+
+    pairs: NearPairs
+    rows: Array
+
+    def add(self, u: Array, f: Array) -> Array:
+        return apply_rows(u, self.rows, self.pairs, f)
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """Velocity (m, 2, N) of the vesicles `mine` due to all others."""
+
+    weights: Array
+    far: PairSum
+    near: tuple[Correction, ...]
+    count: int
+    precision: str
+
+    @classmethod
+    def build(cls, X: Array, mu: float, fields: Fields, mine: slice = slice(None), stored: bool = False) -> Interaction:
+        """For vesicles X (M, 2, N); stored: keep the near rows, as an iterative solver needs them."""
+        xp = array_namespace(X)
+        M, _, N = X.shape
+        index = np.arange(M)[mine]
+        targets = xp.reshape(xp.permute_dims(X[mine], (0, 2, 1)), (len(index) * N, 2))
+        owner = from_numpy(np.repeat(index, N), like=X)
+        dtype = getattr(xp, fields.precision)
+        origin = xp.mean(X, axis=(0, 2))  # subtracted before the precision is lowered
+        lower = lambda a: xp.astype(a, dtype, copy=False)
+        far = pair_sum(lower(targets - origin), lower(X - origin[None, :, None]), mu, owner, fields.far_field, fields.far_tolerance)
+        near = _near(X, targets, owner, mu, fields, stored)
+        return cls(arclength_weights(X)[:, None, :], far, near, len(index), fields.precision)
+
+    def velocity(self, f: Array) -> Array:
+        """(m, 2, N) for force densities f (M, 2, N) of all vesicles."""
+        xp = array_namespace(f)
+        u = self.far.velocity(xp.astype(f * self.weights, getattr(xp, self.precision), copy=False))
+        u = xp.astype(u, f.dtype, copy=False)
+        for correction in self.near:
+            u = correction.add(u, f)
+        return xp.permute_dims(xp.reshape(u, (self.count, f.shape[-1], 2)), (0, 2, 1))
+
+
+def _near(X: Array, targets: Array, owner: Array, mu: float, fields: Fields, stored: bool) -> tuple[Correction, ...]:
+    layered = fields.near_field in METHODS
+    scheme = "upsample" if layered else near_scheme(fields.near_field)
+    if scheme == "none":
+        return ()
+    pairs = find_near(X, targets, near_width(scheme, fields.near_tolerance), owner)
+    if len(pairs) == 0:
+        return ()
+    if stored or scheme == "ying_zorin":
+        return (NearRows(pairs, near_correction(X, targets, pairs, mu, scheme, fields.near_tolerance)),)
+    if not layered:
+        return (NearSums.build(X, targets, pairs, mu, fields.near_tolerance),)
+    assert fields.layers is not None
+    h = to_numpy(length(X)) / X.shape[-1]
+    inner = np.abs(to_numpy(pairs.distance)) <= max(fields.offsets) * h[to_numpy(pairs.vesicle)]
+    corrections: list[Correction] = []
+    if inner.any():
+        part = pairs.subset(np.flatnonzero(inner))
+        corrections.append(NearLayers.build(X, targets, part, mu, fields.near_field, fields.layers, fields.offsets))
+    if not inner.all():
+        corrections.append(NearSums.build(X, targets, pairs.subset(np.flatnonzero(~inner)), mu, fields.near_tolerance))
+    return tuple(corrections)
