@@ -6,7 +6,7 @@ error estimate: max |X_{dt/2, dt/2} - X_dt| over the mean length of the membrane
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,10 +31,11 @@ class Extrapolated:
         half = self.inner.step(state, 0.5 * dt)
         two = self.inner.step(half.state, 0.5 * dt)
         coarse, fine = whole.state, two.state
-        X, sigma = fine.X, fine.sigma
+        X, sigma, coupling = fine.X, fine.sigma, fine.coupling
         if self.order == 2:
             X = 2.0 * fine.X - coarse.X
             sigma = None if fine.sigma is None or coarse.sigma is None else 2.0 * fine.sigma - coarse.sigma
+            coupling = coarse.coupling  # of an extrapolated state, unlike that of the half step
         parts = [result.diagnostics for result in (whole, half, two)]
         diagnostics = {name: max(d.get(name, 0.0) for d in parts) for name in dict.fromkeys(name for d in parts for name in d)}
         for name in SUMS:
@@ -44,4 +45,4 @@ class Extrapolated:
         diagnostics["error_estimate"] = float(np.max(np.abs(to_numpy(fine.X - coarse.X))) / np.mean(length(before)))
         for name, measure in (("area_change", area), ("length_change", length)):
             diagnostics[name] = float(np.max(np.abs(measure(after) / measure(before) - 1.0)))
-        return StepResult(replace(fine, t=state.t + dt, X=X, sigma=sigma), diagnostics)
+        return StepResult(State(state.t + dt, X, sigma, coupling), diagnostics)

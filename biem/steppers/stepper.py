@@ -13,8 +13,8 @@ from biem.backend import Array
 class State:
     """Membranes X (M, 2, N) at time t; sigma (M, N) is their tension, or None where nothing has asked for it.
 
-    coupling: a time, the velocity (M, 2, N) that the vesicles then induced on each other, and its rate; a solver that takes this
-    velocity explicitly predicts it from there.
+    coupling: an earlier time, the velocity (M, 2, N) that the flow and the other vesicles then gave the nodes, and its rate; a solver
+    that takes this velocity explicitly goes on from there.
     """
 
     t: float

@@ -1,6 +1,11 @@
 """What a scene does not require is not built: counts of real steps, and `plan` tells the same story. Steps and times."""
 
+import os
 import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,3 +136,92 @@ def test_a_fluid_at_rest_has_no_flow_time():
     with pytest.raises(ValueError, match=r"time\.dt = \"0\.01 t_gamma\".*no t_gamma"):
         build(make_scene(rest))
     assert build(make_scene({**rest, "time": {"dt": "0.1 t_kappa", "horizon": 1.0}})).dt > 0
+
+
+# The split solver: what it needs, and what it takes
+
+SPLIT = {"solver": {"kind": "split"}}
+CORRECTED = {"area and length correction", "redistribution of nodes"}
+SPLIT_PLANS = {  # changes of the scene and what is needed beyond relaxation and corrections
+    "rest": (REST, set()),
+    "flow": ({}, {"background flow", "advection"}),
+    "tension at rest": ({**REST, "output": {"tension": True}}, {"tension"}),
+    "pair": (CLOSE, {"background flow", "advection", "tension", "vesicle-vesicle coupling", "far field", "near field"}),
+    "pair at rest": ({**CLOSE, **REST}, {"advection", "tension", "vesicle-vesicle coupling", "far field", "near field"}),
+    "no near field": (
+        {**CLOSE, "solver": {"near_field": "none"}},
+        {"background flow", "advection", "tension", "vesicle-vesicle coupling", "far field"},
+    ),
+    "adaptive, order 2": (
+        {"time": {"adaptive": True, "order": 2}},
+        {"background flow", "advection", "extrapolation", "step size control"},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SPLIT_PLANS)
+def test_plan_of_the_split_solver_lists_what_is_needed_and_no_more(tmp_path, case):
+    changes, needed = SPLIT_PLANS[case]
+    changes = {**changes, "solver": {**SPLIT["solver"], **changes.get("solver", {})}}
+    plan = printed_plan(tmp_path, changes)
+    assert {name for name, yes in plan.items() if yes} == needed | {"relaxation", *CORRECTED}
+    counts = simulate(scene_of(changes, time={"horizon": 3 * DT})).counts
+    factors = counts["tension_matrix"] > 0  # of the maps that advection and tension are made by
+    assert factors == bool(needed & {"advection", "tension"})
+    assert (counts["pair_sum"] > 0) == ("far field" in needed)
+    assert (counts["near_search"] > 0) == ("near field" in needed)
+
+
+def test_plan_names_the_far_field_near_field_and_repulsion_of_a_scene(tmp_path):
+    options = ["--set", 'solver.near_field="layers"', "--set", "solver.repulsion={reach = 0.1}", "--set", 'solver.far_field="direct"']
+    out = cli("plan", write_scene(tmp_path, CLOSE, SPLIT), "--no-measure", *options).output
+    assert re.search(r"yes  far field +direct sum of 32 points", out)
+    assert re.search(r"yes  near field .*layers within 1 h", out)
+    assert re.search(r"yes  repulsion +where a gap is below 0\.1 lengths", out)
+    assert re.search(r"yes  vesicle-vesicle coupling +2 vesicles: explicit", out)
+
+
+def crowd(M, N=32, **solver):
+    """A split problem of M copies of one shape on a square grid at an area fraction of about 0.25, made without any search."""
+    table_ = {"vesicles": {"points": N, "reduced_area": 0.65}, "solver": {"kind": "split", **solver}}
+    one = build(scene_of(table_))
+    side = int(np.ceil(np.sqrt(M)))
+    pitch = np.sqrt(np.pi * one.radius**2 / 0.25)
+    centers = pitch * np.stack([np.arange(M) % side, np.arange(M) // side], axis=1)
+    return replace(one, X=one.X + centers[:, :, None])
+
+
+@pytest.mark.parametrize("options", [{}, {"far_tolerance": 1e-5, "near_tolerance": 1e-5}, {"dtype": "float32"}, {"device": "torch"}])
+def test_memory_of_the_split_solver_is_linear_in_the_number_of_vesicles(options):
+    few, many = (memory_estimate(crowd(M, **options)) for M in (2000, 8000))
+    assert 3.5 < many / few < 4.5
+
+
+def test_single_precision_takes_less():
+    for M in (100, 2000):
+        assert memory_estimate(crowd(M, dtype="float32")) < 0.9 * memory_estimate(crowd(M))
+
+
+STEP_OF_MANY = """
+import resource, sys
+sys.path.insert(0, {tests!r})
+from test_plan import crowd
+from biem.__main__ import _seconds_a_step
+from biem.scene.plan import memory_estimate
+peak = lambda: 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+_seconds_a_step(crowd(20))  # libraries loaded, loops compiled
+problem = crowd({M})
+before = peak()
+_seconds_a_step(problem)
+print(peak() - before, memory_estimate(problem))
+"""
+
+
+def test_memory_estimate_is_what_a_step_takes():
+    """Within a factor of 3 of the measured growth of the peak."""
+    program = STEP_OF_MANY.format(tests=str(Path(__file__).parent), M=500)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, timeout=120)
+    measured, estimated = map(float, done.stdout.split())
+    assert measured > 10e6
+    assert 1 / 3 < estimated / measured < 3, (measured, estimated)
