@@ -1,4 +1,4 @@
-# make demo: set up everything, run two vesicles in shear, leave pictures in out/demo. make test: set up everything, run the tests.
+# make demo: set up everything, run two vesicles in shear and 100 in a channel flow, leave pictures in out/demo. make test: set up everything, run the tests.
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
@@ -16,7 +16,9 @@ $(READY): pyproject.toml constraints.txt
 
 demo: $(READY)
 	$(BIN)/python -m biem run configs/scenes/shear_pair.toml -o out/demo/shear_pair.h5 --force
-	$(BIN)/python -m biem plot out/demo/shear_pair.h5 -o out/demo
+	$(BIN)/python -m biem plot out/demo/shear_pair.h5 -o out/demo/shear_pair
+	$(BIN)/python -m biem run configs/scenes/poiseuille_100.toml -o out/demo/poiseuille_100.h5 --force
+	$(BIN)/python -m biem plot out/demo/poiseuille_100.h5 -o out/demo/poiseuille_100
 
 test: $(READY)
 	$(BIN)/python -m pytest

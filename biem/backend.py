@@ -7,6 +7,7 @@ Importing this module imports no torch.
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,6 +27,7 @@ Array = Any  # a NumPy array or a PyTorch tensor
 FFTW_PAYS_ABOVE = 50_000
 
 _counts: ContextVar[Counter[str] | None] = ContextVar("counts", default=None)
+_timing: ContextVar[tuple[dict[str, float], Callable[[], None]] | None] = ContextVar("timing", default=None)
 
 
 @contextmanager
@@ -44,6 +46,32 @@ def count(name: str, n: int = 1) -> None:
     counts = _counts.get()
     if counts is not None:
         counts[name] += n
+
+
+@contextmanager
+def timing(wait: Callable[[], None] = lambda: None) -> Iterator[dict[str, float]]:
+    """Wall seconds of the stages that run inside the block, by name. wait: called at both ends of a stage, to let a device finish."""
+    seconds: dict[str, float] = {}
+    token = _timing.set((seconds, wait))
+    try:
+        yield seconds
+    finally:
+        _timing.reset(token)
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Adds the wall time of the block to the stage `name` of the innermost `timing()` block, if there is one. Stages do not nest."""
+    clock = _timing.get()
+    if clock is None:
+        yield
+        return
+    seconds, wait = clock
+    wait()
+    begin = time.perf_counter()
+    yield
+    wait()
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
 def fft_backend(size: int) -> Any:
@@ -115,17 +143,17 @@ def scatter_add(u: Array, index: Array, values: Array) -> Array:
 
 
 class Latest:
-    """Remembers what was made for the array last seen; the array itself is what it is known by, so it must not change in place."""
+    """Remembers what was made for the object last seen: known by its identity, so an array must not change in place."""
 
     def __init__(self) -> None:
-        self._array: Array = None
+        self._object: Any = None
         self._made: Any = None
 
-    def of(self, array: Array, make: Callable[[], Any]) -> Any:
-        """What `make()` gave for this very array, made now if it is another one."""
-        if self._array is not array:
+    def of(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What `make()` gave for this very object, made now if it is another one."""
+        if self._object is not key:
             self._made = make()
-            self._array = array
+            self._object = key
         return self._made
 
 

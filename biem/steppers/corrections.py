@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from array_api_compat import array_namespace
 
-from biem.backend import Array, count, from_numpy, on_cpu, parallel_map, to_numpy
+from biem.backend import Array, count, from_numpy, on_cpu, parallel_map, stage, to_numpy
 from biem.curves.conserve import restore_area_length
 from biem.curves.curve import area, length
 from biem.curves.reparam import redistribute
@@ -63,7 +63,8 @@ class Corrected:
             parts = parallel_map(correct, [slice(i, min(i + CHUNK, mine.stop)) for i in range(mine.start, mine.stop, CHUNK)])
             return xp.concat([part for part, _ in parts], axis=0), sum(restored for _, restored in parts)
 
-        both, restored = self.ranks.gather_all(X.shape[0], correct_all)
+        with stage("corrections"):
+            both, restored = self.ranks.gather_all(X.shape[0], correct_all)
         if REDISTRIBUTE in self.corrections:
             count("redistributed", X.shape[0])
         if AREA_LENGTH in self.corrections:

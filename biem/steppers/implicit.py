@@ -19,7 +19,7 @@ import numpy as np
 from array_api_compat import array_namespace
 from scipy.sparse.linalg import LinearOperator, gmres
 
-from biem.backend import Array, constant, count, from_numpy, one_blas_thread, parallel_map, to_numpy
+from biem.backend import Array, constant, count, from_numpy, one_blas_thread, parallel_map, stage, to_numpy
 from biem.curves.fourier import read_back, read_back_matrix, resample, resampling_matrix
 from biem.errors import NumericalFailure
 from biem.membrane.maps import operator_points
@@ -59,7 +59,8 @@ class ImplicitStepper:
     def _step_coupled(self, state: State, dt: float) -> StepResult:
         X = state.X
         u_inf = 0.0 * X if self.flow is None else self.flow(X, state.t)
-        response = self._response(X, dt)
+        with stage("response"):
+            response = self._response(X, dt)
         coupling = Interaction.build(X, self.mu, self.fields, stored=True)
         repulsive = None if self.repulsion is None else self.repulsion.force(X)
         if repulsive is not None:

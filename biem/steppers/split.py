@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 from array_api_compat import array_namespace
 
-from biem.backend import Array, Latest, one_blas_thread
+from biem.backend import Array, Latest, one_blas_thread, stage
 from biem.membrane.maps import MembraneMaps
 from biem.membrane.operators import bending_force, tension_force
 from biem.membrane.repulsion import Repulsion, work_of
@@ -30,13 +30,13 @@ FIRST_SWEEPS, FIRST_CHANGE = 20, 1e-6  # of the fixed-point iteration at the sta
 
 @dataclass(frozen=True)
 class _Advection:
-    """What a step takes from X^n. velocity u, rate a: None where nothing moves the vesicles; sigma: None where nobody asks for it."""
+    """What a step takes from X^n. velocity u and its rate: None where nothing moves the vesicles; sigma: None where nobody asks for it."""
 
-    velocity: Array | None = None
-    rate: Array | None = None
+    X_mine: Array  # one array for all maps of a step, so that they can share their factors
+    velocity: Array = None
+    rate: Array = None
     sigma: Array | None = None
     repulsive: Array | None = None
-    projected: tuple[Array, Array] | None = None  # (1 - M) u, (1 - M) a
 
 
 @dataclass(frozen=True)
@@ -60,31 +60,34 @@ class SplitStepper:
         """The state at t + dt; sigma is the tension at t."""
         with one_blas_thread():
             # steps of different dt from one state, as extrapolation makes them, share everything but the relaxation
-            a = self._advection.of(state.X, lambda: self._advect(state, dt))
+            a = self._advection.of(state, lambda: self._advect(state, dt))
             X = self._move(state.X, a, dt)
         coupling = None if a.velocity is None else (state.t, a.velocity, a.rate)
         return StepResult(State(state.t + dt, X, a.sigma, coupling), work_of(a.repulsive, state.X, X - state.X))
 
     def _move(self, X: Array, a: _Advection, dt: float) -> Array:
-        if a.projected is not None:
-            velocity, rate = a.projected
-            X = X + dt * (velocity + 0.5 * dt * rate)
-        return self.ranks.gather(X.shape[0], lambda mine: self.maps.relax(X[mine], dt))
+        M = X.shape[0]
+        if a.velocity is not None:
+            u = a.velocity + 0.5 * dt * a.rate
+            with stage("advection"):
+                X = X + dt * self.ranks.gather(M, lambda mine: self.maps.advect(a.X_mine, u[mine]))
+        with stage("relaxation"):
+            return self.ranks.gather(M, lambda mine: self.maps.relax(X[mine], dt))
 
     def _advect(self, state: State, dt: float) -> _Advection:
         if self.flow is None and state.X.shape[0] == 1:
-            return _Advection(sigma=-self.maps.self_tension(state.X) if self.tension else None)
+            return _Advection(state.X, sigma=-self.maps.self_tension(state.X) if self.tension else None)
         if state.coupling is not None:
             return self._evaluate(state)
         start = self._evaluate(state)  # the rate is not known yet: it is taken from half a step on trial
         trial = replace(state, t=state.t + 0.5 * dt, X=self._move(state.X, start, 0.5 * dt))
         rate = (self._evaluate(trial).velocity - start.velocity) / (0.5 * dt)
-        return self._evaluate(replace(state, coupling=(state.t - dt, start.velocity - dt * rate, rate)))
+        return replace(start, rate=rate)
 
     def _evaluate(self, state: State) -> _Advection:
         """Velocity and tension at the state; without an earlier velocity to go on from, by iteration and without a rate."""
         X, M = state.X, state.X.shape[0]
-        X_mine = X[self.ranks.mine(M)]  # one array for all maps of this step, so that they can share their factors
+        X_mine = X[self.ranks.mine(M)]
         gather = lambda function: self.ranks.gather(M, function)
         u_inf = 0.0 * X if self.flow is None else self.flow(X, state.t)
         repulsive = None if self.repulsion is None else self.repulsion.force(X)
@@ -93,8 +96,13 @@ class SplitStepper:
         sigma = None
         u = u_inf
         if M > 1 or self.tension:
-            self_tension = gather(lambda mine: self.maps.self_tension(X_mine))
-            tension = lambda u: -(self_tension + gather(lambda mine: self.maps.flow_tension(X_mine, u[mine])))
+            with stage("self-tension"):
+                self_tension = gather(lambda mine: self.maps.self_tension(X_mine))
+
+            def tension(u: Array) -> Array:
+                with stage("flow tension"):
+                    return -(self_tension + gather(lambda mine: self.maps.flow_tension(X_mine, u[mine])))
+
         if M > 1:
             own_force = bending_force(X, self.kappa_b) + (0.0 if repulsive is None else repulsive)
             interaction = Interaction.build(X, self.mu, self.fields, self.ranks.mine(M))
@@ -108,8 +116,7 @@ class SplitStepper:
         elif self.tension:
             sigma = tension(u)
         rate = 0.0 * u if state.coupling is None else (u - state.coupling[1]) / (state.t - state.coupling[0])
-        advect = lambda v: gather(lambda mine: self.maps.advect(X_mine, v[mine]))
-        return _Advection(u, rate, sigma, repulsive, (advect(u), advect(rate)))
+        return _Advection(X_mine, u, rate, sigma, repulsive)
 
 
 def _fixed_point(tension: Callable[[Array], Array], velocity: Callable[[Array], Array], u: Array) -> tuple[Array, Array]:

@@ -28,8 +28,8 @@ import scipy.fft
 from array_api_compat import array_namespace, is_torch_array
 from scipy.special import erfc, exp1
 
-from biem.backend import Array, count, from_numpy, threads, to_numpy
-from biem.stokes.farfield_direct import compiled, own_sum, own_sum_of_arrays
+from biem.backend import Array, compiled, count, from_numpy, threads, to_numpy
+from biem.stokes.farfield_direct import own_sum, own_sum_of_arrays
 from biem.stokes.kernels import stokeslet_prefactor
 
 BITS, FIRST = 7, -24  # real-space table: 2^7 cubics an octave of r^2, from 2^-24

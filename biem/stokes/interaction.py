@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from array_api_compat import array_namespace
 
-from biem.backend import Array, from_numpy, to_numpy
+from biem.backend import Array, from_numpy, stage, to_numpy
 from biem.curves.curve import arclength_weights, length
 from biem.stokes.farfield import PairSum, pair_sum
 from biem.stokes.near import apply_rows, near_correction, near_width
@@ -75,17 +75,21 @@ class Interaction:
         dtype = getattr(xp, fields.precision)
         origin = xp.mean(X, axis=(0, 2))  # subtracted before the precision is lowered
         lower = lambda a: xp.astype(a, dtype, copy=False)
-        far = pair_sum(lower(targets - origin), lower(X - origin[None, :, None]), mu, owner, fields.far_field, fields.far_tolerance)
-        near = _near(X, targets, owner, mu, fields, stored)
+        with stage("far"):
+            far = pair_sum(lower(targets - origin), lower(X - origin[None, :, None]), mu, owner, fields.far_field, fields.far_tolerance)
+        with stage("near"):
+            near = _near(X, targets, owner, mu, fields, stored)
         return cls(arclength_weights(X)[:, None, :], far, near, len(index), fields.precision)
 
     def velocity(self, f: Array) -> Array:
         """(m, 2, N) for force densities f (M, 2, N) of all vesicles."""
         xp = array_namespace(f)
-        u = self.far.velocity(xp.astype(f * self.weights, getattr(xp, self.precision), copy=False))
-        u = xp.astype(u, f.dtype, copy=False)
-        for correction in self.near:
-            u = correction.add(u, f)
+        with stage("far"):
+            u = self.far.velocity(xp.astype(f * self.weights, getattr(xp, self.precision), copy=False))
+            u = xp.astype(u, f.dtype, copy=False)
+        with stage("near"):
+            for correction in self.near:
+                u = correction.add(u, f)
         return xp.permute_dims(xp.reshape(u, (self.count, f.shape[-1], 2)), (0, 2, 1))
 
 

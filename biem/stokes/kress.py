@@ -74,11 +74,10 @@ def kernel_blocks(X: Array, X_alpha: Array, mu: float) -> Array:
 @cache
 def circulant(n: int) -> np.ndarray:
     """c_d (n,): weights over 2 pi/n of the quadrature of log|2 sin(alpha/2)|, less its values (no value at d = 0), times the log's sign."""
-    d = np.arange(n)
-    k = np.arange(1, n // 2)
-    weights = -(np.cos(2 * np.pi * np.outer(d, k) / n) / k).sum(1) - (1 - 2.0 * (d % 2)) / n
+    k = np.arange(n // 2 + 1)
+    weights = -0.5 * n * np.fft.irfft(np.where(k == 0, 0.0, 1.0 / np.maximum(k, 1)), n)
     values = np.zeros(n)
-    values[1:] = np.log(2 * np.sin(np.pi * d[1:] / n))
+    values[1:] = np.log(2 * np.sin(np.pi * np.arange(1, n) / n))
     return LOG_SIGN * (weights - values)
 
 
