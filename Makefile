@@ -1,4 +1,5 @@
-# make demo: set up everything, run two vesicles in shear and 100 in a channel flow, leave pictures in out/demo. make test: set up everything, run the tests.
+# make demo: set up everything, run two vesicles in shear and 100 in a parabolic flow, leave pictures in out/demo.
+# make test: set up everything, run the tests, on as many processes as there are cores.
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
@@ -21,7 +22,7 @@ demo: $(READY)
 	$(BIN)/python -m biem plot out/demo/poiseuille_100.h5 -o out/demo/poiseuille_100
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: $(READY)
 	$(BIN)/ruff check .

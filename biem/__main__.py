@@ -48,9 +48,6 @@ def one_line_errors(ranks: Ranks = ALONE) -> Iterator[None]:
         _fail(f"file error: {error}", 5, ranks)
     except (ValueError, MemoryError) as error:
         _fail(str(error), 2, ranks)
-    except Exception:
-        ranks.abort()  # one rank alone: the others would wait for it
-        raise
 
 
 def _fail(message: str, code: int, ranks: Ranks = ALONE) -> None:
@@ -73,13 +70,14 @@ def run(
     with one_line_errors():
         ranks = world()
     with one_line_errors(ranks):
-        loaded = _load(scene, solver, overrides)
+        loaded = ranks.together(lambda: _load(scene, solver, overrides))
         path = output or Path(loaded.output.trajectory or f"out/{loaded.name}.h5")
-        for notice in build(loaded).notices if loaded.vesicles.file and ranks.rank == 0 else ():
+        notices = ranks.on_root(lambda: build(loaded).notices if loaded.vesicles.file else ())
+        for notice in notices if ranks.rank == 0 else ():
             typer.echo(f"notice: {notice}", err=True)
         done = simulate(loaded, path, resume=resume, force=force, progress=not quiet, ranks=ranks)
         if not quiet and ranks.rank == 0:
-            typer.echo(_summary(done.trajectory, path, done.counts))
+            typer.echo(_summary(done.trajectory, path, done.counts, ranks))
 
 
 @app.command()
@@ -90,6 +88,7 @@ def plan(
     overrides: Overrides = None,
 ) -> None:
     """Print what a scene requires, and why, with memory, file size and time."""
+    _first_rank_only()
     with one_line_errors():
         problem = build(_load(scene, solver, overrides))
         M, _, N = problem.X.shape
@@ -114,6 +113,7 @@ def plot(
     movie: Annotated[bool, typer.Option(help="Draw the movie.")] = True,
 ) -> None:
     """Draw frames, energies, errors and a movie."""
+    _first_rank_only()
     with one_line_errors():
         from biem.run.plot import draw_all  # matplotlib loads slowly: only where it is needed
 
@@ -127,6 +127,7 @@ def verify(trajectory: TrajectoryPath) -> None:
     """Check a trajectory file: schema, finite values, areas and lengths, crossings, energies."""
     from biem.run.verify import verify as check_all
 
+    _first_rank_only()
     with one_line_errors():
         checks = check_all(read_trajectory(trajectory))
         for check in checks:
@@ -134,6 +135,12 @@ def verify(trajectory: TrajectoryPath) -> None:
         failed = sum(not check.passed for check in checks)
         if failed:
             _fail(f"{failed} of {len(checks)} checks failed on {trajectory}", 3)
+
+
+def _first_rank_only() -> None:
+    with one_line_errors():
+        if world().rank > 0:
+            raise typer.Exit
 
 
 def _load(path: Path, solver: str | None, overrides: list[str] | None) -> Scene:
@@ -161,7 +168,7 @@ def _clock(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
-def _summary(trajectory: Trajectory, path: Path, counts: Counter[str]) -> str:
+def _summary(trajectory: Trajectory, path: Path, counts: Counter[str], ranks: Ranks) -> str:
     d = trajectory.diagnostics
     seconds = float((d["wall_seconds"][1:] * np.diff(trajectory.step)).sum())
     lines = [
@@ -171,7 +178,8 @@ def _summary(trajectory: Trajectory, path: Path, counts: Counter[str]) -> str:
     if trajectory.X.shape[1] > 1:
         gmres = d["gmres_iterations"].max()
         lines.append(f"smallest gap {d['min_gap'].min():.4g}" + (f"; at most {gmres:.0f} GMRES iterations a step" if gmres else ""))
-    lines.append("used: " + ", ".join(f"{name} {n}" for name, n in sorted(counts.items())))
+    lines.append("used: " if ranks.size == 1 else f"used by the first of {ranks.size} processes: ")
+    lines[-1] += ", ".join(f"{name} {n}" for name, n in sorted(counts.items()))
     return "\n".join(lines)
 
 

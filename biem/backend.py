@@ -7,6 +7,7 @@ Importing this module imports no torch.
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -116,6 +117,8 @@ def on_cpu(a: Array) -> bool:
 
 def compiled(module: str) -> Any:
     """A module of compiled loops, set to run on `threads()` threads; numba is loaded here, where it is needed."""
+    if "numba" not in sys.modules:
+        os.environ.setdefault("NUMBA_NUM_THREADS", str(threads()))  # else it starts, and lets PyTorch start, one for every core
     import numba
 
     loops = import_module(module)

@@ -16,6 +16,8 @@ from biem.curves import shapes
 from biem.curves.curve import area, bending_energy, centroid, effective_radius, inclination, length, normal
 from biem.curves.fourier import coefficients, evaluate, read_back, resample
 from biem.curves.reparam import redistribute
+from biem.membrane.maps import operator_points
+from biem.membrane.operators import VesicleOperators
 from biem.steppers.corrections import CORRECTIONS, Corrected
 from biem.steppers.implicit import ImplicitStepper
 from biem.steppers.stepper import State, Stepper
@@ -60,8 +62,8 @@ def operators() -> None:
     def quantities(maps: ExactMaps, X: np.ndarray) -> dict[str, np.ndarray]:
         alpha = 2 * np.pi * np.arange(X.shape[-1]) / X.shape[-1]
         wave = lambda k: np.broadcast_to(np.stack([np.cos(k * alpha), np.sin(k * alpha)]), X.shape)
-        ops = maps.operators(X)
-        n = ops.X.shape[-1]
+        n = operator_points(X.shape[-1], maps.points)
+        ops = VesicleOperators(resample(X, n))
         f = resample(np.broadcast_to(np.stack([np.sin(alpha), np.cos(alpha)]), X.shape), n)
         u = (full_matrix(ops.S_blocks) @ f.reshape(len(X), -1, 1)).reshape(len(X), 2, n)
         return {

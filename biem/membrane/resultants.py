@@ -23,7 +23,7 @@ from math import pi
 
 from array_api_compat import array_namespace
 
-from biem.backend import Array, constant, count, from_numpy, on_cpu, parallel_map, solve, to_numpy
+from biem.backend import Array, compiled, constant, count, from_numpy, on_cpu, parallel_map, solve, to_numpy
 from biem.curves.curve import center_of_nodes, d_ds, dot
 from biem.curves.fourier import derivative, differentiation_matrix
 from biem.stokes.kress import apply_single_layer, single_layer_kernel
@@ -163,12 +163,17 @@ def in_frame(G: Array, a: Array, b: Array) -> Array:
 
 
 def inverse_factor(A: Array) -> Array:
-    """W (M, n, n) with W^T W = A^-1 for symmetric positive definite A (M, n, n); not finite where A is not."""
-    if on_cpu(A):
-        return _compiled(A, "inverse_factor", A)
+    """W (M, n, n) with W^T W = A^-1 for symmetric positive definite A (M, n, n); not finite where A is not.
+
+    A direction that A annihilates to rounding is left out, as the constant tension of a circle, which exerts no force.
+    """
     xp = array_namespace(A)
+    least = 4.0 * A.shape[-1] * float(xp.finfo(A.dtype).eps)
+    if on_cpu(A):
+        return _compiled(A, "inverse_factor", A, least)
     identity = xp.broadcast_to(xp.eye(A.shape[-1], dtype=A.dtype, device=A.device), A.shape)
-    factor, _ = xp.linalg.cholesky_ex(A)  # torch: without the check that waits for the device
+    shift = least * xp.max(xp.linalg.diagonal(A), axis=-1)
+    factor, _ = xp.linalg.cholesky_ex(A + shift[:, None, None] * identity)  # torch: without the check that waits for the device
     return xp.linalg.solve_triangular(factor, identity, upper=False)
 
 
@@ -180,10 +185,9 @@ def dot_product_matrix(A: Array, a: Array, b: Array) -> Array:
     return A * (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
 
 
-def _compiled(like: Array, name: str, *arrays: Array) -> Array:
-    from biem.membrane import resultants_loop
-
-    return from_numpy(getattr(resultants_loop, name)(*(to_numpy(a) for a in arrays)), like)
+def _compiled(like: Array, name: str, *arguments: Array) -> Array:
+    arguments = tuple(a if isinstance(a, float) else to_numpy(a) for a in arguments)
+    return from_numpy(getattr(compiled("biem.membrane.resultants_loop"), name)(*arguments), like)
 
 
 def _matvec(A: Array, x: Array) -> Array:

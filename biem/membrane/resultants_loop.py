@@ -39,8 +39,10 @@ def dot_product_matrix(A: Any, a: Any, b: Any) -> Any:
 
 
 @njit(**OPTIONS)
-def inverse_factor(A: Any) -> Any:
+def inverse_factor(A: Any, least: float) -> Any:
     """W (M, n, n), lower triangular, with W^T W = A^-1 for symmetric positive definite A (M, n, n); NaN where A is not.
+
+    A pivot within `least` of zero, relative to the largest element of the diagonal, is left out: its row of W is zero.
 
     Cholesky of [A | I] by rows, eight at a time: W is what becomes of I.
     """
@@ -53,6 +55,9 @@ def inverse_factor(A: Any) -> Any:
                 work[i, j] = A[m, i, j]
                 work[i, n + j] = 0.0
             work[i, n + i] = 1.0
+        small = 0.0
+        for i in range(n):
+            small = max(small, least * A[m, i, i])
         for k in range(0, n, 8):
             end = min(k + 8, n)
             for i in range(k, end):
@@ -61,7 +66,7 @@ def inverse_factor(A: Any) -> Any:
                     for j in range(i, n + i):
                         work[i, j] -= f * work[p, j]
                 f = work[i, i]
-                f = 1.0 / np.sqrt(f) if f > 0.0 else np.nan
+                f = 1.0 / np.sqrt(f) if f > small else (0.0 if f >= -small else np.nan)
                 for j in range(i, n + i + 1):
                     work[i, j] *= f
             for i in range(end, n):  # never after a block of fewer than eight rows

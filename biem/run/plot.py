@@ -20,6 +20,7 @@ from biem.curves.fourier import resample
 from biem.run.trajectory import Trajectory
 
 FACE, EDGE = "#e8a33d", "#7a3b00"
+MOST_PATHS = 200  # of vesicles drawn one by one
 SNAPSHOTS = 6
 MOVIE_FRAMES = 100
 LEAST_CORNERS = 128
@@ -79,7 +80,8 @@ def _view(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw(axes: Any, X: np.ndarray, center: np.ndarray, half: np.ndarray) -> PolyCollection:
-    shapes = PolyCollection(list(_outlines(X)), facecolor=FACE, edgecolor=EDGE, linewidth=0.8)
+    line = float(np.clip(5.0 * np.ptp(X, axis=2).max() / half[0], 0.1, 0.8))  # thinner where the vesicles are small
+    shapes = PolyCollection(list(_outlines(X)), facecolor=FACE, edgecolor=EDGE, linewidth=line)
     axes.add_collection(shapes)
     axes.set_aspect("equal")
     axes.set_xlim(center[0] - half[0], center[0] + half[0])
@@ -118,7 +120,8 @@ def _history(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) ->
     axes[1].set_ylabel("relative error of a step,\nbefore correction")
     axes[1].legend(frameon=False)
     if trajectory.X.shape[1] > 1:
-        axes[2].semilogy(time, d["min_gap"], color="tab:green")
+        axes[2].plot(time, d["min_gap"], color="tab:green")
+        axes[2].set_yscale("log" if d["min_gap"].min() < 0.5 * d["min_gap"].max() else "linear")
         axes[2].set_ylabel("smallest gap")
     else:
         axes[2].plot(time[1:], d["wall_seconds"][1:], color="tab:gray")
@@ -141,7 +144,14 @@ def _separation(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path)
 def _lateral(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) -> Path:
     y = np.stack([centroid(X)[:, 1] for X in trajectory.X]) / trajectory.attributes["flow_width"]
     figure, axes = _figure(6.5, 4.0)
-    axes[0].plot(time, y, color=EDGE, linewidth=0.8, alpha=max(0.1, y.shape[1] ** -0.5))
+    if y.shape[1] <= MOST_PATHS:
+        axes[0].plot(time, y, color=EDGE, linewidth=0.8, alpha=max(0.1, y.shape[1] ** -0.5))
+    else:
+        for share, alpha in ((0.9, 0.15), (0.5, 0.3)):
+            low, high = np.quantile(y, [0.5 - share / 2, 0.5 + share / 2], axis=1)
+            axes[0].fill_between(time, low, high, color=FACE, alpha=alpha, linewidth=0, label=f"the middle {share:.0%}")
+        axes[0].plot(time, np.median(y, axis=1), color=EDGE, label="median")
+        axes[0].legend(frameon=False)
     axes[0].set_xlabel(unit)
     axes[0].set_ylabel("lateral position y / W")
     axes[0].grid(alpha=0.3)

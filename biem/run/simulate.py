@@ -67,16 +67,19 @@ def simulate(
     back from a run into a file. Raises ValueError for input that is wrong (before anything is touched), NumericalFailure for a rejected
     step (the last good state is in the trajectory and the checkpoint), Stopped after a signal, OSError where the output cannot be written.
     """
-    path = None if output is None else Path(output)
+    return ranks.together(lambda: _simulate(scene, None if output is None else Path(output), resume, force, progress, ranks))
+
+
+def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progress: bool, ranks: Ranks) -> Run:
     resolved = json.dumps(scene.model_dump(mode="json"))
     found = ranks.on_root(lambda: where_to_resume(path, resolved, resume, force))
-    problem = build(scene)
+    problem = ranks.together(lambda: build(scene))
     if found is None:
         start = Checkpoint(0, State(0.0, problem.X), area(problem.X), length(problem.X), resolved, run=uuid4().hex)
         earlier = _frame(problem, start.step, start.state, {})
     else:
         start, earlier = found
-    stepper = make_stepper(problem, start.area_0, start.length_0, ranks)
+    stepper = ranks.together(lambda: make_stepper(problem, start.area_0, start.length_0, ranks))
     start = replace(start, state=on_device(start.state, scene, ranks))
     attributes = {
         "schema": SCHEMA,
@@ -202,10 +205,14 @@ class _Loop:
 
     def _try(self, dt: float) -> StepResult:
         """A step that the guard lets pass."""
-        with np.errstate(all="ignore"):  # what is not finite is the guard's to name
-            result = self.stepper.step(self.state, dt)
-        check_state(result.state.X, result.state.sigma, result.diagnostics, self.problem.scene.solver.max_error)
-        return result
+
+        def attempt() -> StepResult:
+            with np.errstate(all="ignore"):  # what is not finite is the guard's to name
+                result = self.stepper.step(self.state, dt)
+            check_state(result.state.X, result.state.sigma, result.diagnostics, self.problem.scene.solver.max_error)
+            return result
+
+        return self.ranks.together(attempt)
 
     def _take(self, t_next: float, dt: float, result: StepResult, rejected: int, begin: float) -> None:
         """The step becomes the present state; rejected: steps tried before it; begin: time at which the first of them began."""

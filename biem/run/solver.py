@@ -40,9 +40,10 @@ def check_machine(problem: Problem, ranks: Ranks = ALONE) -> None:
     needed = memory_estimate(problem)
     if needed > free:
         M, _, N = problem.X.shape
+        way = 'solver.kind = "split"' if problem.scene.solver.kind == "implicit" else 'solver.dtype = "float32"'
         raise ValueError(
-            f"a step of {M} vesicles of {N} nodes needs about {needed / 1e9:.1f} GB of memory, {free / 1e9:.1f} GB are free: take fewer "
-            'vesicles or nodes, solver.kind = "split", or more machines'
+            f"a step of {M} vesicles of {N} nodes needs about {needed / 1e6:.3g} MB of memory, {free / 1e6:.3g} MB are free: take fewer "
+            f"vesicles or nodes, or {way}"
         )
 
 

@@ -211,6 +211,8 @@ def _explain(error: Any) -> str:
         near = difflib.get_close_matches(str(error["loc"][-1]), known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else "the keys there are " + ", ".join(known)
         return f"unknown key {path}: {hint}"
+    if path == "solver.device":
+        return f'{path} = {error["input"]!r}: expected "cpu" (NumPy), "torch" (PyTorch on the CPU), "cuda" or "cuda:N"'
     if error["type"] == "missing":
         return f"key {path} is missing"
     if error["type"] == "model_type":

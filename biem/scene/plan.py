@@ -30,7 +30,7 @@ def required_parts(problem: Problem) -> list[Part]:
     M = problem.X.shape[0]
     solver, output, time = problem.scene.solver, problem.scene.output, problem.scene.time
     many, flowing, split = M > 1, problem.flow.kind != "quiescent", solver.kind == "split"
-    moved = "the other vesicles" if many else "the flow"
+    moved = " and ".join(["the flow"] * flowing + ["the other vesicles"] * many)
     parts = [
         Part("relaxation", True, "bending is implicit: one dense solve a vesicle"),
         Part("background flow", flowing, f"flow {problem.flow.kind}" if flowing else "the fluid is at rest"),

@@ -50,16 +50,23 @@ def _pays(grid: Grid, targets: int, sources: int) -> bool:
 
 
 def pair_sum(
-    targets: Array, X: Array, mu: float, exclude: Array | None = None, far_field: str = "auto", tolerance: float = 1e-6
+    targets: Array,
+    X: Array,
+    mu: float,
+    exclude: Array | None = None,
+    far_field: str = "auto",
+    tolerance: float = 1e-6,
+    of: int | None = None,
 ) -> PairSum:
     """u(x_p) = sum over curves j and nodes n of G(x_p - X_jn) f_jn ds_jn for fixed targets (P, 2) and X (M, 2, N), for several forces.
 
     exclude (P,), integers: the curve whose nodes a target skips (-1: none). tolerance: relative L2 error of "ewald". "auto" decides by
-    `far_scheme`, and takes "direct" where the points lie so unevenly that Ewald's sum would not be cheaper. Raises as `far_scheme`.
+    `far_scheme`, and takes "direct" where the points lie so unevenly that Ewald's sum would not be cheaper. of: the number of all targets
+    where these are a part of them, so that "auto" decides the same for all parts. Raises as `far_scheme`.
     """
     cuda = is_torch_array(X) and X.device.type == "cuda"
-    P, S = targets.shape[0], X.shape[0] * X.shape[2]
-    if far_scheme(far_field, P, S, tolerance, cuda) == "direct" or P == 0:
+    P, S = targets.shape[0] if of is None else of, X.shape[0] * X.shape[2]
+    if far_scheme(far_field, P, S, tolerance, cuda) == "direct" or targets.shape[0] == 0:
         return DirectSum(targets, X, mu, exclude)
     ewald = EwaldSum(targets, X, mu, exclude, tolerance)
     return ewald if far_field == "ewald" or _pays(ewald.grid, P, S) else DirectSum(targets, X, mu, exclude)

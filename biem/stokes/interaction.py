@@ -76,7 +76,8 @@ class Interaction:
         origin = xp.mean(X, axis=(0, 2))  # subtracted before the precision is lowered
         lower = lambda a: xp.astype(a, dtype, copy=False)
         with stage("far"):
-            far = pair_sum(lower(targets - origin), lower(X - origin[None, :, None]), mu, owner, fields.far_field, fields.far_tolerance)
+            points = lower(targets - origin), lower(X - origin[None, :, None])
+            far = pair_sum(*points, mu=mu, exclude=owner, far_field=fields.far_field, tolerance=fields.far_tolerance, of=M * N)
         with stage("near"):
             near = _near(X, targets, owner, mu, fields, stored)
         return cls(arclength_weights(X)[:, None, :], far, near, len(index), fields.precision)

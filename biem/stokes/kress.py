@@ -15,10 +15,12 @@ from math import pi
 import numpy as np
 from array_api_compat import array_namespace
 
-from biem.backend import Array, constant, count, from_numpy, on_cpu, to_numpy
+from biem.backend import Array, compiled, constant, count, from_numpy, on_cpu, to_numpy
 from biem.curves.curve import center_of_nodes, dot
 from biem.curves.fourier import derivative, resample
 from biem.stokes.kernels import LOG_SIGN, stokeslet, stokeslet_prefactor
+
+LOOPS = "biem.stokes.kress_loop"
 
 
 def single_layer_kernel(X: Array, X_alpha: Array, mu: float = 1.0) -> Array:
@@ -26,10 +28,8 @@ def single_layer_kernel(X: Array, X_alpha: Array, mu: float = 1.0) -> Array:
     count("single_layer_matrix", X.shape[0])
     if not on_cpu(X):
         return kernel_blocks(X, X_alpha, mu)
-    from biem.stokes import kress_loop
-
     arrays = (to_numpy(X), to_numpy(X_alpha), circulant(X.shape[-1]))
-    return from_numpy(kress_loop.kernel_blocks(*arrays, stokeslet_prefactor(mu), LOG_SIGN), like=X)
+    return from_numpy(compiled(LOOPS).kernel_blocks(*arrays, stokeslet_prefactor(mu), LOG_SIGN), like=X)
 
 
 def apply_single_layer(X: Array, X_alpha: Array, g: Array, mu: float = 1.0) -> Array:
@@ -39,10 +39,8 @@ def apply_single_layer(X: Array, X_alpha: Array, g: Array, mu: float = 1.0) -> A
         K = kernel_blocks(X, X_alpha, mu)
         x, y = g[:, 0, :, None], g[:, 1, :, None]
         return xp.stack([xp.matmul(K[:, 0], x) + xp.matmul(K[:, 1], y), xp.matmul(K[:, 1], x) + xp.matmul(K[:, 2], y)], axis=1)[..., 0]
-    from biem.stokes import kress_loop
-
     arrays = (to_numpy(X), to_numpy(X_alpha), to_numpy(g), circulant(X.shape[-1]))
-    return from_numpy(kress_loop.apply_kernel(*arrays, stokeslet_prefactor(mu), LOG_SIGN), like=X)
+    return from_numpy(compiled(LOOPS).apply_kernel(*arrays, stokeslet_prefactor(mu), LOG_SIGN), like=X)
 
 
 def on_own_curve(X: Array, f: Array, mu: float = 1.0) -> Array:
