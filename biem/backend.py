@@ -182,6 +182,13 @@ def one_blas_thread() -> Any:
     return _blas().limit(limits=1)
 
 
+def shares(start: int, stop: int, least: int, most: int) -> list[slice]:
+    """[start, stop) in slices of nearly one size, at most `most`: a whole number for every thread where none is below `least` then."""
+    count = max(1, stop - start)
+    pieces = max(-(-count // most), min(count // least, threads() * -(-count // (threads() * most))), 1)
+    return [slice(start + count * k // pieces, start + count * (k + 1) // pieces) for k in range(pieces)]
+
+
 def parallel_map(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
     """[function(item) for item in items], on threads; BLAS is kept to one thread in each. Counts of `counting()` are kept."""
     with one_blas_thread():

@@ -16,6 +16,7 @@ from biem.errors import NumericalFailure
 
 TOLERANCE = 1e-10  # relative, of area and of length
 MAX_ITERATIONS = 60
+SINGULAR = 1e-12  # |det J| over |J|^2 below which J counts as of rank one
 
 
 def restore_area_length(X: Array, area_0: Array, length_0: Array, first: int = 0) -> tuple[Array, int]:
@@ -35,7 +36,7 @@ def restore_area_length(X: Array, area_0: Array, length_0: Array, first: int = 0
     Y = X
     for _ in range(MAX_ITERATIONS):
         J = xp.stack([_derivatives(Y, d, area_0, length_0) for d in directions], axis=-1)
-        lambdas = xp.matmul(xp.linalg.pinv(J, rtol=1e-12), -off[..., None])[..., 0]
+        lambdas = _least_squares(J, -off)
         step = lambdas[:, 0, None, None] * directions[0] + lambdas[:, 1, None, None] * directions[1]
         Y = xp.where((xp.max(xp.abs(off), axis=-1) > TOLERANCE)[:, None, None], Y + step, Y)
         off = _errors(Y, area_0, length_0)
@@ -46,6 +47,17 @@ def restore_area_length(X: Array, area_0: Array, length_0: Array, first: int = 0
         f"area and length of vesicle {first + worst} could not be restored: relative errors {float(off[worst, 0]):.1e}, "
         f"{float(off[worst, 1]):.1e} after {MAX_ITERATIONS} iterations; use smaller steps"
     )
+
+
+def _least_squares(J: Array, b: Array) -> Array:
+    """x (M, 2) of least squares and least norm with J x = b. J: (M, 2, 2), b: (M, 2)."""
+    xp = array_namespace(J)
+    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+    size = xp.sum(J * J, axis=(1, 2))
+    regular = xp.abs(det) > SINGULAR * size
+    adjugate = xp.stack([J[:, 1, 1] * b[:, 0] - J[:, 0, 1] * b[:, 1], J[:, 0, 0] * b[:, 1] - J[:, 1, 0] * b[:, 0]], axis=-1)
+    rank_one = xp.sum(J * b[:, :, None], axis=1) / size[:, None]  # J^T b / |J|^2
+    return xp.where(regular[:, None], adjugate / xp.where(regular, det, size)[:, None], rank_one)
 
 
 def _errors(X: Array, area_0: Array, length_0: Array) -> Array:

@@ -23,12 +23,12 @@ from math import pi
 
 from array_api_compat import array_namespace
 
-from biem.backend import Array, compiled, constant, count, from_numpy, on_cpu, parallel_map, solve, to_numpy
+from biem.backend import Array, compiled, constant, count, from_numpy, on_cpu, parallel_map, shares, solve, to_numpy
 from biem.curves.curve import center_of_nodes, d_ds, dot
 from biem.curves.fourier import derivative, differentiation_matrix
 from biem.stokes.kress import apply_single_layer, single_layer_kernel
 
-CPU_CHUNK, DEVICE_CHUNK = 1 << 16, 1 << 25  # entries of one n x n matrix over all vesicles in work: to fit the cache, the memory
+CPU_CHUNK, DEVICE_CHUNK = 1 << 17, 1 << 25  # entries of one n x n matrix over all vesicles in work: to fit the cache, the memory
 
 
 @dataclass(frozen=True)
@@ -133,10 +133,12 @@ class Resultants:
     def _by_chunk(self, function: Callable[..., Array], *fields: Array) -> Array:
         """function(part, *fields of the part) over chunks of vesicles, joined."""
         M, _, n = self.X.shape
-        step = max(1, (CPU_CHUNK if on_cpu(self.X) else DEVICE_CHUNK) // n**2)
+        on_host = on_cpu(self.X)
         _ = self.bending  # the geometry is made for all vesicles at once
-        work = [(self._part(slice(i, i + step)), *(f[i : i + step] for f in fields)) for i in range(0, M, step)]
-        parts = parallel_map(lambda args: function(*args), work) if on_cpu(self.X) else [function(*args) for args in work]
+        most = max(1, (CPU_CHUNK if on_host else DEVICE_CHUNK) // n**2)
+        chunks = shares(0, M, 1, most) if on_host else [slice(i, i + most) for i in range(0, M, most)]
+        work = [(self._part(chunk), *(f[chunk] for f in fields)) for chunk in chunks]
+        parts = parallel_map(lambda args: function(*args), work) if on_host else [function(*args) for args in work]
         return parts[0] if len(parts) == 1 else array_namespace(self.X).concat(parts, axis=0)
 
     def _part(self, which: slice) -> Resultants:

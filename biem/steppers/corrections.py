@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from array_api_compat import array_namespace
 
-from biem.backend import Array, count, from_numpy, on_cpu, parallel_map, stage, to_numpy
+from biem.backend import Array, count, from_numpy, on_cpu, parallel_map, shares, stage, to_numpy
 from biem.curves.conserve import restore_area_length
 from biem.curves.curve import area, length
 from biem.curves.reparam import redistribute
@@ -18,7 +18,7 @@ from biem.steppers.stepper import State, Stepper, StepResult
 
 REDISTRIBUTE = "redistribute"
 AREA_LENGTH = "area_length"
-CHUNK = 256  # vesicles that one thread corrects at a time
+LEAST, MOST = 256, 2048  # vesicles that one thread corrects at a time; on fewer, threads wait for each other
 CORRECTIONS = (REDISTRIBUTE, AREA_LENGTH)
 
 
@@ -60,7 +60,7 @@ class Corrected:
         def correct_all(mine: slice) -> tuple[Array, int]:
             if not on_cpu(X):
                 return correct(mine)
-            parts = parallel_map(correct, [slice(i, min(i + CHUNK, mine.stop)) for i in range(mine.start, mine.stop, CHUNK)])
+            parts = parallel_map(correct, shares(mine.start, mine.stop, LEAST, MOST))
             return xp.concat([part for part, _ in parts], axis=0), sum(restored for _, restored in parts)
 
         with stage("corrections"):
