@@ -37,7 +37,18 @@ from biem.steppers.stepper import State
 
 TILE = 504  # vesicles of one packing
 FRACTION = 0.3
-STAGES = ("near", "far", "self-tension", "flow tension", "advection", "relaxation", "response", "corrections", "guard")
+STAGES = (
+    "near",
+    "far",
+    "self-tension",
+    "flow tension",
+    "advection",
+    "relaxation",
+    "response",
+    "redistribution",
+    "area and length",
+    "guard",
+)
 
 
 def packing(count: int, points: int) -> np.ndarray:

@@ -5,6 +5,7 @@ area_error and length_error in the diagnostics are the largest relative errors t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from array_api_compat import array_namespace
@@ -48,25 +49,33 @@ class Corrected:
         if not self.corrections or not bool(xp.all(xp.isfinite(X))):  # what is not finite is the guard's to reject
             return StepResult(result.state, diagnostics)
 
-        def correct(which: slice) -> tuple[Array, int]:
-            """X and, where it is known, sigma, stacked; and how many areas and lengths were restored."""
-            Y, fields, restored = X[which], [] if sigma is None else [sigma[which]], 0
-            if REDISTRIBUTE in self.corrections:
-                Y, *fields = redistribute(Y, *fields, first=which.start)
-            if AREA_LENGTH in self.corrections:
-                Y, restored = restore_area_length(Y, area_0[which], length_0[which], first=which.start)
-            return xp.concat([Y, *(f[:, None, :] for f in fields)], axis=1), restored
+        if REDISTRIBUTE in self.corrections:
 
-        def correct_all(mine: slice) -> tuple[Array, int]:
+            def redistributed(which: slice) -> tuple[Array, int]:
+                moved = redistribute(X[which], *([] if sigma is None else [sigma[which]]), first=which.start)
+                return xp.concat([moved[0], *(f[:, None, :] for f in moved[1:])], axis=1), which.stop - which.start
+
+            with stage("redistribution"):
+                both, moved = self._by_chunk(X, redistributed)
+            count("redistributed", moved)
+            X, sigma = both[:, :2], None if sigma is None else both[:, 2]
+        if AREA_LENGTH in self.corrections:
+            Y = X
+            restore = lambda which: restore_area_length(Y[which], area_0[which], length_0[which], first=which.start)
+            with stage("area and length"):
+                X, restored = self._by_chunk(Y, restore)
+            count("area_length_restored", restored)
+        return StepResult(replace(result.state, X=X, sigma=sigma), diagnostics)
+
+    def _by_chunk(self, X: Array, correct: Callable[[slice], tuple[Array, int]]) -> tuple[Array, int]:
+        """What `correct` makes of slices of the vesicles, joined, and the sum of its counts."""
+        xp = array_namespace(X)
+
+        def all_of(mine: slice) -> tuple[Array, int]:
             if not on_cpu(X):
                 return correct(mine)
             parts = parallel_map(correct, shares(mine.start, mine.stop, LEAST, MOST))
-            return xp.concat([part for part, _ in parts], axis=0), sum(restored for _, restored in parts)
+            return xp.concat([part for part, _ in parts], axis=0), sum(n for _, n in parts)
 
-        with stage("corrections"):
-            both, restored = self.ranks.gather_all(X.shape[0], correct_all)
-        if REDISTRIBUTE in self.corrections:
-            count("redistributed", X.shape[0])
-        if AREA_LENGTH in self.corrections:
-            count("area_length_restored", sum(restored))
-        return StepResult(replace(result.state, X=both[:, :2], sigma=None if sigma is None else both[:, 2]), diagnostics)
+        joined, counts = self.ranks.gather_all(X.shape[0], all_of)
+        return joined, sum(counts)
