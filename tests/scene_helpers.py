@@ -5,11 +5,13 @@ import multiprocessing
 import os
 import signal
 import sys
+from contextlib import contextmanager
 
 import numpy as np
 from typer.testing import CliRunner
 
 from biem.__main__ import app
+from biem.run import simulate as loop
 from biem.run.trajectory import read_trajectory
 from biem.scene.config import make_scene
 
@@ -154,3 +156,14 @@ def die_at(event_number, folder):
                 os.kill(os.getpid(), signal.SIGKILL)
 
     sys.addaudithook(hook)
+
+
+def stop_after(monkeypatch, steps):
+    """A signal is seen from the end of that step on."""
+    looks = iter(range(1, 1000))
+
+    @contextmanager
+    def signals():
+        yield lambda: next(looks) >= steps
+
+    monkeypatch.setattr(loop, "_signals", signals)

@@ -22,7 +22,8 @@ from scipy.linalg import lapack
 from biem.backend import Array, compiled, constant, count, from_numpy, irfft, on_cpu, parallel_map, rfft, scatter_add, to_numpy
 from biem.curves.curve import arclength_weights, center_of_nodes, cross, dot, length, normal
 from biem.curves.fourier import coefficients, derivative, evaluate, resample
-from biem.stokes.kernels import LOG_SIGN, stokeslet, stokeslet_prefactor
+from biem.stokes.farfield_direct import own_sum, own_sum_of_arrays
+from biem.stokes.kernels import LOG_SIGN, stokeslet_prefactor
 from biem.stokes.kress import circulant
 from biem.stokes.near import layer_values
 from biem.stokes.near_search import SEARCH_REFINEMENT, NearPairs
@@ -159,23 +160,9 @@ def curve_sum(points: Array, own: Array, X: Array, weighted_force: Array, mu: fl
     origin = center_of_nodes(X)
     x, y = points - origin[own][..., 0], X - origin
     if not on_cpu(X):
-        return _curve_sum(x, own, y, weighted_force, mu)
-    arrays = (np.ascontiguousarray(to_numpy(a), dtype=np.float64) for a in (y, weighted_force))
-    x64 = np.ascontiguousarray(to_numpy(x), dtype=np.float64)
-    return from_numpy(compiled(LOOPS).sum_own(x64, to_numpy(own), *arrays, stokeslet_prefactor(mu)), like=X)
-
-
-def _curve_sum(x: Array, own: Array, y: Array, g: Array, mu: float) -> Array:
-    xp = array_namespace(x)
-
-    def at(chunk: slice) -> Array:
-        r = x[chunk][:, :, None] - y[own[chunk]]
-        g_own = g[own[chunk]]
-        G_xx, G_xy, G_yy = stokeslet(r[:, 0], r[:, 1], mu)
-        u_x = xp.sum(G_xx * g_own[:, 0] + G_xy * g_own[:, 1], axis=-1)
-        return xp.stack([u_x, xp.sum(G_xy * g_own[:, 0] + G_yy * g_own[:, 1], axis=-1)], axis=-1)
-
-    return _in_chunks(at, x.shape[0], 4 * y.shape[-1], x)
+        return own_sum_of_arrays(x, y, weighted_force, own, mu)
+    x64, y64, g64 = (to_numpy(a).astype(np.float64, copy=False) for a in (x, y, weighted_force))
+    return from_numpy(own_sum(x64, y64, g64, to_numpy(own), mu), like=X)
 
 
 def _exact_layers(X: Array, f: Array, mu: float, offsets: Sequence[float], tolerance: float) -> Array:

@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from biem.stokes.kernels import LOG_SIGN
-from biem.stokes.pair_loop import log
-
 ROW, CLASS = 0x5E3779B1, 0x45EBCA6B  # odd: rows of cells lie anywhere in the table, the cells of a row side by side
 FARTHEST = 2.0**52  # cells from the origin: beyond, positions are coarser than a cell
 BLOCK = 256  # targets that share their scratch memory
@@ -191,27 +188,3 @@ def closest_points(c: Any, x: Any, vesicle: Any, alpha: Any, steps: int, accurac
         x0, x1, X_a[q, 0], X_a[q, 1], X_aa[q, 0], X_aa[q, 1] = _point(curve, a)
         r[q, 0], r[q, 1], at[q] = x0 - x[q, 0], x1 - x[q, 1], a
     return r, X_a, X_aa, at
-
-
-# error_model="numpy": a check for division by zero would stop the vectorization
-@njit(parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"}, cache=True)
-def pair_layers(x: Any, curve: Any, y: Any, g: Any, scale: float) -> Any:
-    """Velocity (Q, 2) at x (Q, 2) of forces g (V, 2, n) at y (V, 2, n) of the one curve of each pair, curve (Q,)."""
-    Q, n = len(x), y.shape[2]
-    u = np.empty((Q, 2))
-    for q in prange(Q):
-        x0, x1 = x[q, 0], x[q, 1]
-        y0, y1, g0, g1 = y[curve[q], 0], y[curve[q], 1], g[curve[q], 0], g[curve[q], 1]
-        ux = uy = 0.0
-        for k in range(n):
-            rx = x0 - y0[k]
-            ry = x1 - y1[k]
-            r2 = rx * rx + ry * ry
-            r2 = r2 if r2 > 0.0 else 1.0  # a point does not act on itself
-            along = (rx * g0[k] + ry * g1[k]) / r2
-            log_r = LOG_SIGN * 0.5 * log(r2)
-            ux += log_r * g0[k] + along * rx
-            uy += log_r * g1[k] + along * ry
-        u[q, 0] = scale * ux
-        u[q, 1] = scale * uy
-    return u

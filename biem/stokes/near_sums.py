@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 from array_api_compat import array_namespace
 
-from biem.backend import Array, compiled, count, from_numpy, on_cpu, scatter_add, to_numpy
+from biem.backend import Array, count, from_numpy, on_cpu, scatter_add, to_numpy
 from biem.curves.curve import arclength_weights, center_of_nodes
 from biem.curves.fourier import resample
-from biem.stokes.kernels import stokeslet, stokeslet_prefactor
+from biem.stokes.farfield_direct import own_sum, own_sum_of_arrays
 from biem.stokes.near import LEVELS, apply_rows, near_correction, upsampling
-from biem.stokes.near_search import CHUNK, LOOPS, NearPairs, float64
+from biem.stokes.near_search import NearPairs, float64
 
 
 @dataclass(frozen=True)
@@ -94,21 +94,5 @@ class Level:
         f = f[self.vesicle]
         g = resample(f, self.Y.shape[-1]) * self.ds_up
         g[..., :: self.factor] -= f * self.ds
-        if use_loops:
-            return compiled(LOOPS).pair_layers(self.x, self.slot, self.Y, g, stokeslet_prefactor(mu))
-        return _pair_layers(self.x, self.slot, self.Y, g, mu)
-
-
-def _pair_layers(x: Array, slot: Array, Y: Array, g: Array, mu: float) -> Array:
-    """`near_loop.pair_layers` in array code."""
-    xp = array_namespace(x)
-    step = max(1, CHUNK // (4 * Y.shape[-1]))
-    parts = []
-    for q in range(0, x.shape[0], step):
-        here = slot[q : q + step]
-        r, force = x[q : q + step, :, None] - Y[here], g[here]
-        xx, xy, yy = stokeslet(r[:, 0], r[:, 1], mu)
-        ux = xp.sum(xx * force[:, 0] + xy * force[:, 1], axis=-1)
-        uy = xp.sum(xy * force[:, 0] + yy * force[:, 1], axis=-1)
-        parts.append(xp.stack([ux, uy], axis=-1))
-    return xp.concat(parts)
+        own = own_sum if use_loops else own_sum_of_arrays
+        return own(self.x, self.Y, g, self.slot, mu)

@@ -3,7 +3,6 @@
 import math
 import re
 import signal
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from scene_helpers import (
     finish,
     scene_of,
     start_cli,
+    stop_after,
     the_error,
     write_flow,
     write_scene,
@@ -61,17 +61,6 @@ def wrap_stepper(monkeypatch, wrap):
             return wrap(self.inner, state, dt)
 
     monkeypatch.setattr(loop, "make_stepper", Wrapped)
-
-
-def stop_after(monkeypatch, steps):
-    """A signal is seen from the end of that step on."""
-    looks = iter(range(1, 1000))
-
-    @contextmanager
-    def signals():
-        yield lambda: next(looks) >= steps
-
-    monkeypatch.setattr(loop, "_signals", signals)
 
 
 @pytest.fixture(scope="module")

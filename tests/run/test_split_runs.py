@@ -1,15 +1,12 @@
 """The split solver through `simulate` and the command line: restarts, counts, diagnostics, options, rejected steps."""
 
-from contextlib import contextmanager
-
 import h5py
 import numpy as np
 import pytest
-from scene_helpers import DT, PAIR, assert_same_frames, cli, scene_of, write_scene
+from scene_helpers import DT, PAIR, assert_same_frames, cli, scene_of, stop_after, write_scene
 
 from biem.curves.curve import area, length
 from biem.errors import NumericalFailure
-from biem.run import simulate as loop
 from biem.run.checkpoint import checkpoint_path, read_checkpoint
 from biem.run.simulate import Stopped, simulate
 from biem.run.trajectory import read_trajectory
@@ -30,17 +27,6 @@ WAYS = {
     "float32": {"solver": {"kind": "split", "dtype": "float32"}},
     "repulsion": REPELLED,
 }
-
-
-def stop_after(monkeypatch, steps):
-    """A signal is seen from the end of that step on."""
-    looks = iter(range(1, 1000))
-
-    @contextmanager
-    def signals():
-        yield lambda: next(looks) >= steps
-
-    monkeypatch.setattr(loop, "_signals", signals)
 
 
 @pytest.mark.parametrize("way", WAYS)

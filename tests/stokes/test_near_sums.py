@@ -10,7 +10,7 @@ from test_near_search import own_nodes, packing
 from biem.backend import counting
 from biem.curves.curve import arclength_weights
 from biem.curves.fourier import coefficients, evaluate, resample
-from biem.stokes import near_sums
+from biem.stokes import farfield_direct
 from biem.stokes.farfield_direct import direct_sum
 from biem.stokes.near import LEVELS, apply_rows, near_correction, near_width, upsampling
 from biem.stokes.near_search import NearPairs, find_near
@@ -65,7 +65,7 @@ def test_array_sums_whatever_the_chunks(monkeypatch):
     X, targets, (f, _), pairs = suspension()
     u = np.zeros_like(targets)
     exact = NearSums.build(X, targets, pairs, MU, 1e-6).add(u, f)
-    monkeypatch.setattr(near_sums, "CHUNK", 2000)
+    monkeypatch.setattr(farfield_direct, "CHUNK", 2000)
     chunked = sums_by_arrays(*map(torch.from_numpy, (X, targets)), pairs, 1e-6).add(*map(torch.from_numpy, (u, f))).numpy()
     assert np.abs(chunked - exact).max() < 1e-12 * np.abs(exact).max()
 
