@@ -145,7 +145,7 @@ def _lateral(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) ->
     y = np.stack([centroid(X)[:, 1] for X in trajectory.X]) / trajectory.attributes["flow_width"]
     figure, axes = _figure(6.5, 4.0)
     if y.shape[1] <= MOST_PATHS:
-        axes[0].plot(time, y, color=EDGE, linewidth=0.8, alpha=max(0.1, y.shape[1] ** -0.5))
+        axes[0].plot(time, y, color=EDGE, linewidth=0.8, alpha=max(0.5, y.shape[1] ** -0.5))
     else:
         for share, alpha in ((0.9, 0.15), (0.5, 0.3)):
             low, high = np.quantile(y, [0.5 - share / 2, 0.5 + share / 2], axis=1)
