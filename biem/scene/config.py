@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import difflib
-import json
 import math
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import Field, PrivateAttr
+
+from biem.scene.tables import Table, read_toml, validated
 
 Kind = Literal["quiescent", "shear", "extensional", "poiseuille", "taylor_green", "rotation", "custom"]
+TIMES = 'a positive, finite number or a number and a unit, as in "0.01 t_gamma"'
+EXPECTED = {  # for keys whose types or patterns say it badly
+    "solver.device": '"cpu" (NumPy), "torch" (PyTorch on the CPU), "cuda" or "cuda:N"',
+    "time.dt": TIMES,
+    "time.horizon": TIMES,
+    "time.dt_min": TIMES,
+}
 FLOAT32_TOLERANCE = 1e-5  # the least that sums in float32 can be asked for
 Correction = Literal["redistribute", "area_length"]
-
-
-class Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Physics(Table):
@@ -96,7 +98,7 @@ class Solver(Table):
     far_field: Literal["auto", "direct", "ewald"] = "auto"
     far_tolerance: float | None = Field(None, gt=0, lt=1)  # default 1e-10, split 1e-6, in float32 1e-5
     repulsion: RepulsionTable | None = None
-    corrections: list[Correction] = ["area_length", "redistribute"]
+    corrections: list[Correction] = Field(["area_length", "redistribute"])
     max_error: float = Field(1e-2, gt=0)  # relative error of area or length in one step (since the start, if not corrected)
 
     @property
@@ -137,26 +139,14 @@ class Scene(Table):
 def load_scene(path: str | Path, overrides: Iterable[str] = ()) -> Scene:
     """The scene in a TOML file, with overrides such as "vesicles.points=32". Raises ValueError with one line for what is wrong."""
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"scene {path} does not exist: give the path of a TOML file, such as configs/scenes/shear_pair.toml") from None
-    except IsADirectoryError:
-        raise ValueError(f"scene {path} is a folder: give the path of a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"scene {path} is not valid TOML: {error}") from None
-    for override in overrides:
-        _override(table, override)
+    table = read_toml(path, "scene", "configs/scenes/shear_pair.toml", overrides)
     table.setdefault("name", path.stem)
     return make_scene(table, path.parent)
 
 
 def make_scene(table: dict[str, Any], folder: str | Path = ".") -> Scene:
     """The scene of a dictionary in the layout of the file. Raises ValueError with one line for what is wrong."""
-    try:
-        scene = Scene.model_validate_json(json.dumps(table, default=str), strict=True)  # as JSON: lists may be tuples, true is no 1
-    except ValidationError as error:
-        raise ValueError("; ".join(dict.fromkeys(_explain(e) for e in error.errors()))) from None
+    scene = validated(Scene, table, EXPECTED)
     scene._folder = Path(folder)
     return scene
 
@@ -182,42 +172,3 @@ def time_value(value: float | str, key: str, units: dict[str, float | None]) -> 
     if not (number > 0 and math.isfinite(number)):
         raise ValueError(f"time.{key} = {value}: expected a positive, finite time")
     return number
-
-
-def _override(table: dict[str, Any], override: str) -> None:
-    key, equals, text = override.partition("=")
-    if not equals or not key.strip():
-        raise ValueError(f'--set {override}: expected key=value, as in "vesicles.points=32"')
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text
-    *parents, last = key.strip().split(".")
-    for parent in parents:
-        table = table.setdefault(parent, {})
-        if not isinstance(table, dict):
-            raise ValueError(f"--set {override}: {parent} is not a table")
-    table[last] = value
-
-
-def _explain(error: Any) -> str:
-    path = ".".join(str(part) for part in error["loc"])
-    if error["type"] == "extra_forbidden":
-        model: Any = Scene
-        for part in error["loc"][:-1]:
-            annotation = model.model_fields[part].annotation
-            model = next((a for a in get_args(annotation) if isinstance(a, type) and issubclass(a, Table)), annotation)
-        known = list(model.model_fields)
-        near = difflib.get_close_matches(str(error["loc"][-1]), known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]}?" if near else "the keys there are " + ", ".join(known)
-        return f"unknown key {path}: {hint}"
-    if path == "solver.device":
-        return f'{path} = {error["input"]!r}: expected "cpu" (NumPy), "torch" (PyTorch on the CPU), "cuda" or "cuda:N"'
-    if error["type"] == "missing":
-        return f"key {path} is missing"
-    if error["type"] == "model_type":
-        return f"{path} = {error['input']!r}: expected a table [{path}]"
-    if path.startswith(("time.dt.", "time.horizon.", "time.dt_min.")):  # one line for the two types that a time may have
-        path = path.rpartition(".")[0]
-        return f'{path} = {error["input"]!r}: expected a positive, finite number or a number and a unit, as in "0.01 t_gamma"'
-    return f"{path} = {error['input']!r}: {error['msg'][0].lower()}{error['msg'][1:]}"
