@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import shapely
 
@@ -34,3 +36,16 @@ def pair_crossings(X: Array, shapes: np.ndarray | None = None) -> list[tuple[int
     meet = shapely.intersects(shapes[i], shapes[j])
     pairs = zip(i[meet].tolist(), j[meet].tolist(), strict=True)
     return [(a, b) for a, b in pairs if shapely.intersects(*polygons(X[[a, b]], FINE))]
+
+
+def fluid_region(curves: Sequence[np.ndarray]) -> shapely.Polygon:
+    """The region inside the first closed curve (2, N) and outside the others, prepared for tests."""
+    rings = [resample(X, FINE * X.shape[-1]).T for X in curves]
+    region = shapely.Polygon(rings[0], rings[1:])
+    shapely.prepare(region)
+    return region
+
+
+def outside_region(shapes: np.ndarray, region: shapely.Polygon) -> list[int]:
+    """Indices of the polygons that do not lie in the region."""
+    return np.flatnonzero(~shapely.contains_properly(region, shapes)).tolist()

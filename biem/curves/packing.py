@@ -42,8 +42,12 @@ def grid(shapes: np.ndarray, box: tuple[float, float], gap: float) -> tuple[np.n
     return centers, np.zeros(M)
 
 
-def random_packing(shapes: np.ndarray, box: tuple[float, float], gap: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def random_packing(
+    shapes: np.ndarray, box: tuple[float, float], gap: float, rng: np.random.Generator, region: shapely.Polygon | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Centres (M, 2) and angles (M,) of a random packing inside the box, no two membranes closer than `gap`.
+
+    region: a part of the box to stay in, no closer to its boundary than `gap`.
 
     Starts from randomly turned vesicles, small enough to turn freely on a square grid; every move may also grow its vesicle, up to full
     size. One vesicle in every other cell of a checkerboard moves at a time: moves in different cells cannot meet. Raises ValueError
@@ -58,12 +62,11 @@ def random_packing(shapes: np.ndarray, box: tuple[float, float], gap: float, rng
             f"{M} vesicles do not fit: they cover {M * one:.3g}, the box of {box[0]:g} x {box[1]:g} has {width.prod():.3g}: "
             f"fewer than {int(width.prod() / one)} can fit"
         )
-    pitch = optimize.brentq(lambda c: np.prod(np.maximum(np.floor(width / c), 0)) - M + 0.5, 1e-9 * width.min(), 2 * width.max())
-    pitch *= 1 - 1e-9
-    per_row = np.floor(width / pitch).astype(int)
-    slot = rng.permutation(per_row.prod())[:M]
-    centers = (np.stack([slot % per_row[0], slot // per_row[0]], axis=1) + 0.5) * width / per_row
+    slots, pitch = _slots(M, width) if region is None else _slots_in(M, width, region, gap)
+    centers = slots[rng.permutation(len(slots))[:M]]
     angles = rng.uniform(-np.pi, np.pi, size=M)
+    room = None if region is None else region.buffer(-gap)
+    shapely.prepare(room)
     size = np.full(M, min(1.0, (pitch - gap) / (2 * radius)))
     if size[0] <= 0:
         raise ValueError(f"{M} vesicles with gaps of {gap:g} do not fit into a box of {box[0]:g} x {box[1]:g}: enlarge it or lower gap")
@@ -101,6 +104,8 @@ def random_packing(shapes: np.ndarray, box: tuple[float, float], gap: float, rng
         free = (np.floor((x + offset) / cell).astype(int) == index[chosen]).all(axis=1)
         free &= ((new.min(axis=1) >= 0.5 * gap) & (new.max(axis=1) <= width - 0.5 * gap)).all(axis=1)
         candidates = np.asarray(shapely.polygons(new))
+        if room is not None:
+            free &= shapely.contains_properly(room, candidates)
         near = cKDTree(x).sparse_distance_matrix(cKDTree(centers), cell, output_type="ndarray")
         near = near[chosen[near["i"]] != near["j"]]
         close = shapely.dwithin(candidates[near["i"]], now[near["j"]], gap)
@@ -108,6 +113,29 @@ def random_packing(shapes: np.ndarray, box: tuple[float, float], gap: float, rng
         accepted = chosen[free]
         centers[accepted], angles[accepted], size[accepted], now[accepted] = x[free], a[free], grown[free], candidates[free]
     return centers, angles
+
+
+def _slots(M: int, width: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centres (S, 2) of at least M squares that fill a box, and their width."""
+    pitch = optimize.brentq(lambda c: np.prod(np.maximum(np.floor(width / c), 0)) - M + 0.5, 1e-9 * width.min(), 2 * width.max())
+    pitch *= 1 - 1e-9
+    per_row = np.floor(width / pitch).astype(int)
+    slot = np.arange(per_row.prod())
+    return (np.stack([slot % per_row[0], slot // per_row[0]], axis=1) + 0.5) * width / per_row, pitch
+
+
+def _slots_in(M: int, width: np.ndarray, region: shapely.Polygon, gap: float) -> tuple[np.ndarray, float]:
+    """The same in a part of the box: squares whose inscribed circles lie in the region, the largest that are found."""
+    wanted = M
+    while True:
+        slots, pitch = _slots(wanted, width)
+        reach = shapely.distance(shapely.points(slots), region.boundary)
+        inside = shapely.contains_xy(region, slots) & (reach > 0.5 * (pitch + gap))
+        if inside.sum() >= M:
+            return slots[inside], pitch
+        wanted = max(wanted + 1, int(1.2 * wanted))
+        if pitch <= gap:
+            raise ValueError(f"{M} vesicles with gaps of {gap:g} do not fit between the walls: lower count, area_fraction or gap")
 
 
 def assemble(shapes: np.ndarray, centers: np.ndarray, angles: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ def equilibrium(points: int, reduced_area: float, perimeter: float = 1.0) -> np.
     Raises ValueError where that shape touches itself (small reduced areas).
     """
     _check(points, reduced_area)
-    X = _curve(_equilibrium_angle(float(reduced_area)))
+    X = curve_of_angle(_equilibrium_angle(float(reduced_area)))
     if self_crossings(resample(X, 256)[None]):
         raise ValueError(f"the equilibrium shape of reduced area {reduced_area} touches itself: choose a larger one")
     return _finish(X, points, perimeter)
@@ -94,13 +94,14 @@ def _arclength() -> np.ndarray:
     return np.arange(FINE) / FINE
 
 
-def _curve(theta_periodic: np.ndarray) -> np.ndarray:
-    """Curve (2, FINE) of unit length with tangent angle 2 pi s + theta_periodic(s); the closure gap is left out."""
-    z_s = np.fft.fft(np.exp(1j * (2 * np.pi * _arclength() + theta_periodic)))
-    k = np.fft.fftfreq(FINE, 1 / FINE)
+def curve_of_angle(theta_periodic: np.ndarray) -> np.ndarray:
+    """Curve (2, n) of unit length with tangent angle 2 pi s + theta_periodic(s) at n nodes; the closure gap is left out."""
+    n = len(theta_periodic)
+    z_s = np.fft.fft(np.exp(1j * (2 * np.pi * np.arange(n) / n + theta_periodic)))
+    k = np.fft.fftfreq(n, 1 / n)
     k[0] = 1
     z_hat = z_s / (2j * np.pi * k)
-    z_hat[[0, FINE // 2]] = 0
+    z_hat[[0, n // 2]] = 0
     z = np.fft.ifft(z_hat)
     return np.stack([z.real, z.imag])
 
@@ -115,7 +116,7 @@ def _equilibrium_angle(reduced_area: float) -> np.ndarray:
 
     def residual(unknown: np.ndarray, target: float) -> np.ndarray:
         b, multiplier = unknown[:-1], unknown[-1]
-        X = _curve(b @ sines)
+        X = curve_of_angle(b @ sines)
         angle = 2 * np.pi * s + b @ sines
         # dA/db_m = int delta z x dz with delta z_s = i e^{i theta} sin_m, by parts: -int delta theta (X . X_s) ds
         gradient = -(sines * (X[0] * np.cos(angle) + X[1] * np.sin(angle))).mean(axis=1)
@@ -155,7 +156,7 @@ def _perturbed_curve(modes: np.ndarray, amplitude: np.ndarray, reduced_area: flo
         raise np.linalg.LinAlgError
 
     def excess(scale: float) -> float:
-        return float(4 * np.pi * area(_curve(closed_angle(scale))[None])[0]) - reduced_area
+        return float(4 * np.pi * area(curve_of_angle(closed_angle(scale))[None])[0]) - reduced_area
 
     try:
         high = 0.0
@@ -164,6 +165,6 @@ def _perturbed_curve(modes: np.ndarray, amplitude: np.ndarray, reduced_area: flo
             if high > 10:
                 return None
         scale = optimize.brentq(excess, max(0.0, high - 0.1), high, xtol=1e-14) if high > 0 else 0.0
-        return _curve(closed_angle(scale))
+        return curve_of_angle(closed_angle(scale))
     except np.linalg.LinAlgError:
         return None

@@ -5,6 +5,7 @@ Node i of one membrane at the distance d < reach outside another one, closest po
     f_i = strength (1 - d/reach) n,   and the opposite force f_i ds_i acts on the other membrane at alpha*,
 
 spread over its nodes by its trigonometric interpolant. Total force and total torque vanish for every pair. X: (M, 2, N).
+Walls repel likewise; what acts on them does not move them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from array_api_compat import array_namespace
 from biem.backend import Array, count, from_numpy, scatter_add, to_numpy
 from biem.curves.curve import arclength_weights, length
 from biem.curves.fourier import coefficients, evaluate, interpolation_matrix
-from biem.stokes.near_search import find_near
+from biem.stokes.near_search import NearPairs, find_near
+from biem.stokes.walls import Walls
 
 
 @dataclass(frozen=True)
@@ -26,9 +28,33 @@ class Repulsion:
 
     reach: float
     strength: float
+    walls: Walls | None = None
 
     def force(self, X: Array) -> Array | None:
         """Force density f (M, 2, N) of the repulsion, or None where no gap is below the reach."""
+        if self.walls is None:
+            return self._between(X)
+        of_walls = self._of_walls(to_numpy(X), self.walls)
+        between = self._between(X)
+        if of_walls is None:
+            return between
+        return from_numpy(of_walls, like=X) + (0.0 if between is None else between)
+
+    def _of_walls(self, X: np.ndarray, walls: Walls) -> np.ndarray | None:
+        """Of the walls on the membranes; where the fluid is inside the curve, its distance and its normal change sign."""
+        M, _, N = X.shape
+        x = X.transpose(0, 2, 1).reshape(M * N, 2)
+        f = np.zeros((M * N, 2))
+        for curve, side in zip(walls.curves, (-1.0, *([1.0] * (len(walls.curves) - 1))), strict=True):
+            pairs = find_near(curve[None], x, self.reach * curve.shape[1] / float(length(curve[None])[0]))
+            pairs = pairs.subset(side * pairs.distance < self.reach)
+            count("repulsed_nodes", len(pairs))
+            size = self.strength * (1.0 - side * pairs.distance / self.reach)
+            np.add.at(f, pairs.target, (side * size)[:, None] * _normals(curve[None], pairs))
+        return f.reshape(M, N, 2).transpose(0, 2, 1) if f.any() else None
+
+    def _between(self, X: Array) -> Array | None:
+        """Of the membranes on each other."""
         M, _, N = X.shape
         if M < 2:
             return None
@@ -41,14 +67,19 @@ class Repulsion:
         if len(pairs) == 0:
             return None
         count("repulsed_nodes", len(pairs))
-        local = to_numpy(X) - to_numpy(X).mean(axis=-1, keepdims=True)
-        X_alpha = evaluate(coefficients(local)[pairs.vesicle], pairs.alpha[:, None], 1)[..., 0]
-        normal = np.stack([X_alpha[:, 1], -X_alpha[:, 0]], axis=1) / np.sqrt((X_alpha**2).sum(1))[:, None]
+        normal = _normals(to_numpy(X), pairs)
         ds = to_numpy(arclength_weights(X))
         F = (self.strength * (1.0 - pairs.distance / self.reach) * ds.ravel()[pairs.target])[:, None] * normal
         nodal = scatter_add(np.zeros((M, N, 2)), pairs.vesicle, -interpolation_matrix(pairs.alpha, N)[:, :, None] * F[:, None, :])
         nodal = scatter_add(nodal.reshape(M * N, 2), pairs.target, F).reshape(M, N, 2)
         return from_numpy(nodal.transpose(0, 2, 1) / ds[:, None, :], like=X)
+
+
+def _normals(X: np.ndarray, pairs: NearPairs) -> np.ndarray:
+    """Outward normals (Q, 2) of the curves X at the pairs' closest points."""
+    local = X - X.mean(axis=-1, keepdims=True)
+    X_alpha = evaluate(coefficients(local)[pairs.vesicle], pairs.alpha[:, None], 1)[..., 0]
+    return np.stack([X_alpha[:, 1], -X_alpha[:, 0]], axis=1) / np.sqrt((X_alpha**2).sum(1))[:, None]
 
 
 def work_of(f: Array | None, X: Array, displacement: Array) -> dict[str, float]:

@@ -14,20 +14,25 @@ import h5py
 @contextmanager
 def atomic_h5(path: Path) -> Iterator[h5py.File]:
     """An HDF5 file to write; it takes the name `path` only when the block has ended well. Raises OSError (disk full, no permission)."""
+    image = io.BytesIO()  # HDF5 that meets a full disk half way cannot even be closed
+    with h5py.File(image, "w") as file:
+        yield file
+    write_atomically(path, image.getbuffer())
+
+
+def write_atomically(path: Path, content: bytes | memoryview) -> None:
+    """A file of this content: the old one, if there is one, until the new one is whole. Raises OSError (disk full, no permission)."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         try:
-            image = io.BytesIO()  # HDF5 that meets a full disk half way cannot even be closed
-            with h5py.File(image, "w") as file:
-                yield file
-            temporary.write_bytes(image.getbuffer())
+            temporary.write_bytes(content)
             _sync(temporary)
             os.replace(temporary, path)
             _sync(path.parent)
-        except OSError as error:
-            raise OSError(f"{path} could not be written: {one_line(error)}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise OSError(f"{path} could not be written: {one_line(error)}") from error
 
 
 def one_line(error: Exception) -> str:

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import shapely
 
 from biem.backend import Array, to_numpy
-from biem.curves.crossing import pair_crossings, polygons, self_crossings
+from biem.curves.crossing import outside_region, pair_crossings, polygons, self_crossings
 from biem.errors import NumericalFailure
 
 
-def check_state(X: Array, sigma: Array | None, diagnostics: Mapping[str, float], max_error: float) -> None:
-    """Raises NumericalFailure for non-finite values, area or length errors above max_error, and crossing membranes."""
+def check_state(
+    X: Array, sigma: Array | None, diagnostics: Mapping[str, float], max_error: float, region: shapely.Polygon | None = None
+) -> None:
+    """Raises NumericalFailure for values not finite, area or length errors above max_error, membranes that cross or leave the region."""
     values = to_numpy(X)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=(1, 2)))
     if len(bad):
@@ -32,3 +35,6 @@ def check_state(X: Array, sigma: Array | None, diagnostics: Mapping[str, float],
     pairs = pair_crossings(values, shapes)
     if pairs:
         raise NumericalFailure(f"vesicles {pairs[0][0]} and {pairs[0][1]} cross ({len(pairs)} pair(s) in all)")
+    out = [] if region is None else outside_region(shapes, region)
+    if out:
+        raise NumericalFailure(f"vesicle {out[0]} crosses a wall ({len(out)} vesicle(s) do)")

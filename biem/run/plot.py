@@ -19,7 +19,7 @@ from biem.curves.curve import centroid, effective_radius
 from biem.curves.fourier import resample
 from biem.run.trajectory import Trajectory
 
-FACE, EDGE = "#e8a33d", "#7a3b00"
+FACE, EDGE, WALL = "#e8a33d", "#7a3b00", "#4a5560"
 MOST_PATHS = 200  # of vesicles drawn one by one
 SNAPSHOTS = 6
 MOVIE_FRAMES = 100
@@ -36,7 +36,7 @@ def draw_all(trajectory: Trajectory, folder: Path, movie: bool = True, progress:
     scene = json.loads(trajectory.attributes["scene"])
     if trajectory.X.shape[1] == 2:
         files.append(_separation(trajectory, time, unit, folder / "separation.png"))
-    if scene["flow"]["kind"] == "poiseuille":
+    if scene["flow"]["kind"] == "poiseuille" or (scene.get("walls") or {}).get("kind") == "channel":
         files.append(_lateral(trajectory, time, unit, folder / "lateral.png"))
     if movie and len(trajectory) > 1:
         files += _movie(trajectory, time, unit, folder / "movie", progress)
@@ -67,8 +67,15 @@ def _outlines(X: np.ndarray) -> np.ndarray:
     return resample(X, max(LEAST_CORNERS, X.shape[-1])).transpose(0, 2, 1)
 
 
-def _view(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre (F, 2) and half width (2,) of a window of fixed size that holds every frame, moving where that makes it smaller."""
+def _view(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Centre (F, 2) and half width (2,) of a window of fixed size that holds every frame, moving where that makes it smaller.
+
+    Where there are walls, the window holds the outer one.
+    """
+    X = trajectory.X
+    walls = trajectory.attributes.get("walls")
+    if walls is not None:
+        X = np.broadcast_to(walls[0], (len(X), 1, *walls[0].shape))
     low, high = X.min(axis=(1, 3)), X.max(axis=(1, 3))
     fixed = np.broadcast_to((low.min(axis=0) + high.max(axis=0)) / 2, low.shape)
     still = (high.max(axis=0) - low.min(axis=0)) / 2
@@ -79,7 +86,10 @@ def _view(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return center, np.maximum(half, 0.35 * half.max())
 
 
-def _draw(axes: Any, X: np.ndarray, center: np.ndarray, half: np.ndarray) -> PolyCollection:
+def _draw(axes: Any, trajectory: Trajectory, frame: int, center: np.ndarray, half: np.ndarray) -> PolyCollection:
+    X = trajectory.X[frame]
+    for k, wall in enumerate(trajectory.attributes.get("walls", ())):
+        axes.fill(*resample(wall, 2 * wall.shape[-1]), facecolor="none" if k == 0 else WALL, edgecolor=WALL, linewidth=1.5 if k == 0 else 0)
     line = float(np.clip(5.0 * np.ptp(X, axis=2).max() / half[0], 0.1, 0.8))  # thinner where the vesicles are small
     shapes = PolyCollection(list(_outlines(X)), facecolor=FACE, edgecolor=EDGE, linewidth=line)
     axes.add_collection(shapes)
@@ -91,7 +101,7 @@ def _draw(axes: Any, X: np.ndarray, center: np.ndarray, half: np.ndarray) -> Pol
 
 def _snapshots(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) -> Path:
     chosen = np.unique(np.linspace(0, len(trajectory) - 1, SNAPSHOTS).round().astype(int))
-    center, half = _view(trajectory.X)
+    center, half = _view(trajectory)
     wide = half[0] > 2.0 * half[1]
     columns = 1 if wide and half[0] > 5 * half[1] else min(len(chosen), 2 if wide else 3)
     rows = -(-len(chosen) // columns)
@@ -101,7 +111,7 @@ def _snapshots(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) 
     for ax in axes.flat[len(chosen) :]:
         ax.axis("off")
     for ax, k in zip(axes.flat, chosen, strict=False):
-        _draw(ax, trajectory.X[k], center[k], half)
+        _draw(ax, trajectory, k, center[k], half)
         ax.set_title(f"{unit} = {time[k]:.4g}", fontsize=9)
         ax.tick_params(labelsize=7)
     figure.savefig(path, dpi=130)
@@ -119,7 +129,7 @@ def _history(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) ->
         axes[1].semilogy(time[1:], np.maximum(d["error_estimate"][1:], 1e-17), label="position (estimate)")
     axes[1].set_ylabel("relative error of a step,\nbefore correction")
     axes[1].legend(frameon=False)
-    if trajectory.X.shape[1] > 1:
+    if trajectory.X.shape[1] > 1 or "walls" in trajectory.attributes:
         axes[2].plot(time, d["min_gap"], color="tab:green")
         axes[2].set_yscale("log" if d["min_gap"].min() < 0.5 * d["min_gap"].max() else "linear")
         axes[2].set_ylabel("smallest gap")
@@ -162,10 +172,10 @@ def _lateral(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) ->
 def _movie(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path, progress: Callable[[Any], Any]) -> list[Path]:
     """GIF, and MP4 where ffmpeg is installed."""
     chosen = np.unique(np.linspace(0, len(trajectory) - 1, MOVIE_FRAMES).round().astype(int))
-    center, half = _view(trajectory.X)
+    center, half = _view(trajectory)
     width = 7.0
     figure, axes = _figure(width, max(2.2, min(9.0, width * half[1] / half[0] + 0.8)))
-    shapes = _draw(axes[0], trajectory.X[0], center[0], half)
+    shapes = _draw(axes[0], trajectory, 0, center[0], half)
     title = axes[0].set_title("")
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # the layout is settled: nothing jumps

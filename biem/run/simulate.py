@@ -91,6 +91,8 @@ def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progre
         "flow_width": problem.flow.width or 0.0,
         "run": start.run,
     }
+    if problem.walls is not None:
+        attributes["walls"] = problem.walls.curves
     files = Output(problem, path, start, attributes, earlier, resume, ranks)
     with counting() as counts, fft_backend(problem.X.size):
         counts.update(start.counts)
@@ -209,7 +211,7 @@ class _Loop:
         def attempt() -> StepResult:
             with np.errstate(all="ignore"):  # what is not finite is the guard's to name
                 result = self.stepper.step(self.state, dt)
-            check_state(result.state.X, result.state.sigma, result.diagnostics, self.problem.scene.solver.max_error)
+            check_state(result.state.X, result.state.sigma, result.diagnostics, self.problem.scene.solver.max_error, self.problem.region)
             return result
 
         return self.ranks.together(attempt)
@@ -280,6 +282,8 @@ def _frame(problem: Problem, step: int, state: State, running: dict[str, float])
     diagnostics["bending_energy"] = float(bending_energy(X, problem.scene.physics.kappa_b).sum())
     diagnostics["wall_seconds"] = running.get("seconds", 0.0) / max(1.0, running.get("steps", 0.0))
     diagnostics["min_gap"] = minimum_gap(X)
+    if problem.walls is not None:
+        diagnostics["min_gap"] = min(diagnostics["min_gap"], float(problem.walls.distance(X.transpose(0, 2, 1).reshape(-1, 2)).min()))
     return one_frame(state.t, step, X, sigma, diagnostics)
 
 

@@ -98,6 +98,7 @@ def _implicit(problem: Problem) -> Stepper:
         _fields(problem.scene),
         _repulsion(problem),
         problem.scene.output.tension,
+        problem.walls,
     )
 
 
@@ -106,7 +107,17 @@ def _split(problem: Problem, ranks: Ranks) -> Stepper:
     physics, solver = scene.physics, scene.solver
     maps = ExactMaps(physics.kappa_b, physics.mu, solver.operator_points, solver.dtype)
     fields = replace(_fields(scene), precision=solver.dtype, layers=maps.near_layers, offsets=LAYERS)
-    return SplitStepper(maps, physics.kappa_b, physics.mu, _flow(problem), fields, _repulsion(problem), scene.output.tension, ranks)
+    return SplitStepper(
+        maps,
+        physics.kappa_b,
+        physics.mu,
+        _flow(problem),
+        fields,
+        _repulsion(problem),
+        scene.output.tension,
+        ranks,
+        walls=problem.walls,
+    )
 
 
 def _fields(scene: Scene) -> Fields:
@@ -124,4 +135,4 @@ def _repulsion(problem: Problem) -> Repulsion | None:
     if table is None:
         return None
     length = problem.length
-    return Repulsion(table.reach * length, table.strength * problem.scene.physics.kappa_b / length**3)
+    return Repulsion(table.reach * length, table.strength * problem.scene.physics.kappa_b / length**3, problem.walls)

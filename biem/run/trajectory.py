@@ -1,6 +1,7 @@
 """Trajectory files: every committed frame stays readable, whenever the writer is killed.
 
-out.h5: t (F,), step (F,), X (F, M, 2, N), sigma (F, M, N) where the solver has a tension, diagnostics/* (F,), attributes.
+out.h5: t (F,), step (F,), X (F, M, 2, N), sigma (F, M, N) where the solver has a tension, diagnostics/* (F,), walls/* (2, N_k) where
+there are walls, the outer one first, attributes.
 dt, error_estimate and rejected came later: files without them are read as zeros.
 While a run is writing, new frames lie one file each in out.h5.frames/ and are merged into out.h5 from time to time and at the end;
 `read_trajectory` reads both. Every file appears by a rename after a sync.
@@ -32,6 +33,7 @@ class Trajectory:
     area_error and length_error are the largest relative errors of a step since the last frame, before correction; bending_energy is
     the suspension's; gmres_iterations the most since the last frame; wall_seconds the mean of a step since then; min_gap is at t; dt is
     of the last step; error_estimate the worst since the last frame, zero where there is none; rejected the steps rejected since then.
+    attributes["walls"]: the curves (2, N_k) of the walls, where there are any.
     """
 
     t: np.ndarray
@@ -137,7 +139,10 @@ class TrajectoryWriter:
             for name, values in frames.diagnostics.items():
                 file[f"diagnostics/{name}"] = values
             for name, value in self.attributes.items():
-                file.attrs[name] = value
+                if name != "walls":
+                    file.attrs[name] = value
+            for k, X in enumerate(self.attributes.get("walls", ())):
+                file[f"walls/{k}"] = X
 
 
 def exists(path: Path) -> bool:
@@ -166,7 +171,10 @@ def _read(path: Path) -> Trajectory:
             sigma = file["sigma"][:] if "sigma" in file else None
             t, stored = file["t"][:], file["diagnostics"]
             diagnostics = {name: stored[name][:] if name in stored else np.zeros(len(t)) for name in DIAGNOSTICS}
-            return Trajectory(t, file["step"][:], file["X"][:], sigma, diagnostics, dict(file.attrs))
+            attributes = dict(file.attrs)
+            if "walls" in file:
+                attributes["walls"] = tuple(file[f"walls/{k}"][:] for k in range(len(file["walls"])))
+            return Trajectory(t, file["step"][:], file["X"][:], sigma, diagnostics, attributes)
     except OSError as error:
         if not path.exists():
             raise FileNotFoundError(f"trajectory {path} does not exist") from None

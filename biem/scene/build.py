@@ -6,24 +6,31 @@ from dataclasses import dataclass
 
 import h5py
 import numpy as np
+import shapely
 
-from biem.curves.crossing import pair_crossings, polygons, self_crossings
+from biem.curves.crossing import fluid_region, outside_region, pair_crossings, polygons, self_crossings
 from biem.curves.curve import area, effective_radius, length, reduced_area
 from biem.curves.fourier import remove_nyquist
 from biem.curves.packing import assemble, grid, random_packing
 from biem.curves.shapes import ellipse, equilibrium, perturbed
-from biem.scene.config import FLOAT32_TOLERANCE, Scene, Solver, Vesicles, time_value
+from biem.scene.config import FLOAT32_TOLERANCE, FlowTable, Scene, Solver, Vesicles, time_value
 from biem.scene.flows import BackgroundFlow, capillary_factor, make_flow
+from biem.scene.walls import make_walls
+from biem.stokes.walls import Walls
 
 MOST_STEPS = 1e12
 LARGEST_SHRINKAGE = 1000.0  # of adaptive steps, from the first one
 LEAST_TOLERANCE = 1e-9  # of adaptive steps
+WALL_NODES_PER_LENGTH = 32  # on walls, by default, per membrane length
 SHAPES = {"equilibrium": equilibrium, "ellipse": ellipse}
 
 
 @dataclass(frozen=True)
 class Problem:
-    """X (M, 2, N) at t = 0, the flow, dt, dt_min and horizon in the scene's units; notices: what was changed in the input."""
+    """X (M, 2, N) at t = 0, the flow, dt, dt_min and horizon in the scene's units; notices: what was changed in the input.
+
+    walls, region: the walls and the fluid between them, or None where there are none; then flow is what the walls drive.
+    """
 
     scene: Scene
     X: np.ndarray
@@ -33,6 +40,8 @@ class Problem:
     horizon: float
     t_kappa: float
     notices: tuple[str, ...] = ()
+    walls: Walls | None = None
+    region: shapely.Polygon | None = None
 
     @property
     def steps(self) -> int:
@@ -52,10 +61,23 @@ class Problem:
 
 def build(scene: Scene) -> Problem:
     """The problem of a scene. Raises ValueError with one line for what is wrong."""
-    X, notices = _membranes(scene)
-    _check_membranes(X)
-    radius = float(np.sqrt(np.mean(area(X)) / np.pi))
-    flow = _flow(scene, radius)
+    v = scene.vesicles
+    from_file = None if v.file is None else _from_file(scene)
+    if from_file is None:
+        radius, one = v.length * np.sqrt(v.reduced_area) / (2 * np.pi), v.length
+    else:
+        radius, one = float(np.sqrt(np.mean(area(from_file[0])) / np.pi)), float(np.mean(length(from_file[0])))
+    walls, region = None, None
+    if scene.walls is None:
+        flow = _flow(scene, radius)
+    else:
+        if scene.flow != FlowTable():
+            raise ValueError("[walls] drive the flow between them: remove [flow]")
+        spacing = one / WALL_NODES_PER_LENGTH
+        walls, flow = make_walls(scene.walls, scene.physics.mu, scene.physics.kappa_b, radius, spacing, scene.folder)
+        region = fluid_region(walls.curves)
+    X, notices = from_file or (_membranes(scene, region), ())
+    _check_membranes(X, region)
     if flow.kind == "rotation":
         _check_rotation(X)
     t_kappa = scene.physics.mu * radius**3 / scene.physics.kappa_b
@@ -66,7 +88,7 @@ def build(scene: Scene) -> Problem:
     points = scene.solver.operator_points
     if points is not None and points < X.shape[-1]:
         raise ValueError(f"solver.operator_points = {points} is below vesicles.points = {X.shape[-1]}: choose at least as many")
-    return Problem(scene, X, flow, dt, dt_min, horizon, t_kappa, notices)
+    return Problem(scene, X, flow, dt, dt_min, horizon, t_kappa, notices, walls, region)
 
 
 def _check_solver(scene: Scene) -> None:
@@ -109,10 +131,8 @@ def _times(scene: Scene, units: dict[str, float | None]) -> tuple[float, float, 
     return dt, dt_min, horizon
 
 
-def _membranes(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
+def _membranes(scene: Scene, region: shapely.Polygon | None) -> np.ndarray:
     v = scene.vesicles
-    if v.file is not None:
-        return _from_file(scene)
     single = _shape(v, np.random.default_rng(v.seed))
     if v.placement == "explicit":
         for name in ("count", "area_fraction", "box", "corner"):
@@ -127,10 +147,13 @@ def _membranes(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
         if v.unit == "R":
             centers = centers * float(effective_radius(single[None])[0])
         shapes = _shapes(v, single, len(centers))
-        return assemble(shapes, centers, angles), ()
+        return assemble(shapes, centers, angles)
     if v.centers is not None or v.angles is not None:
         raise ValueError('vesicles.centers and angles go with placement = "explicit"')
-    count, box = _count_and_box(v, float(area(single[None])[0]))
+    one = float(area(single[None])[0])
+    if region is not None and v.placement == "random" and v.box is None:
+        return _packed(v, single, one, region)
+    count, box = _count_and_box(v, one)
     shapes = _shapes(v, single, count)
     gap = v.gap * v.length
     if v.placement == "grid":
@@ -138,7 +161,22 @@ def _membranes(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     else:
         centers, angles = random_packing(shapes, box, gap, np.random.default_rng([v.seed, 1]))
     corner = (-box[0] / 2, -box[1] / 2) if v.corner is None else v.corner
-    return assemble(shapes, centers + np.asarray(corner), angles), ()
+    return assemble(shapes, centers + np.asarray(corner), angles)
+
+
+def _packed(v: Vesicles, single: np.ndarray, one: float, region: shapely.Polygon) -> np.ndarray:
+    """Random positions all over the fluid between walls."""
+    if (v.count is None) == (v.area_fraction is None):
+        raise ValueError('vesicles: placement = "random" between walls needs count or area_fraction (of the fluid), one of them')
+    if v.corner is not None:
+        raise ValueError("vesicles.corner goes with a box")
+    count = v.count or max(1, round((v.area_fraction or 0.0) * region.area / one))
+    shapes = _shapes(v, single, count)
+    x0, y0, x1, y1 = region.bounds
+    moved = shapely.transform(region, lambda p: p - (x0, y0))
+    rng = np.random.default_rng([v.seed, 1])
+    centers, angles = random_packing(shapes, (x1 - x0, y1 - y0), v.gap * v.length, rng, moved)
+    return assemble(shapes, centers + np.array([x0, y0]), angles)
 
 
 def _shape(v: Vesicles, rng: np.random.Generator) -> np.ndarray:
@@ -217,7 +255,7 @@ def _from_file(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     return remove_nyquist(X), tuple(notices)
 
 
-def _check_membranes(X: np.ndarray) -> None:
+def _check_membranes(X: np.ndarray, region: shapely.Polygon | None) -> None:
     crossed = self_crossings(X)
     if crossed:
         raise ValueError(f"vesicle {crossed[0]} crosses itself ({len(crossed)} in all do): give simple closed curves")
@@ -225,6 +263,9 @@ def _check_membranes(X: np.ndarray) -> None:
     if pairs:
         i, j = pairs[0]
         raise ValueError(f"vesicles {i} and {j} overlap ({len(pairs)} pair(s) in all do): move them apart")
+    out = [] if region is None else outside_region(polygons(X), region)
+    if out:
+        raise ValueError(f"vesicle {out[0]} is not between the walls ({len(out)} in all are not): move it into the fluid")
     nu = reduced_area(X)
     bad = np.flatnonzero(~((nu > 0) & (nu <= 1 + 1e-9)))
     if len(bad):
@@ -234,8 +275,6 @@ def _check_membranes(X: np.ndarray) -> None:
 
 
 def _check_rotation(X: np.ndarray) -> None:
-    import shapely
-
     inside = np.flatnonzero(shapely.intersects_xy(polygons(X), 0.0, 0.0))
     if len(inside):
         raise ValueError(f"vesicle {inside[0]} covers the origin, where the flow rotation is singular: move it away")

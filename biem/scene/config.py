@@ -62,6 +62,40 @@ class FlowTable(Table):
     function: str | None = None
 
 
+class Obstacle(Table):
+    """A rigid body in the fluid. size: radius of the circle of equal area; angle, rad; omega: its angular velocity."""
+
+    shape: Literal["circle", "ellipse", "polygon", "star"] = "circle"
+    center: tuple[float, float]
+    size: float = Field(gt=0)
+    angle: float = 0.0
+    aspect: float = Field(0.5, gt=0.05, le=1)  # ellipse: short over long axis
+    sides: int = Field(4, ge=3, le=12)  # polygon: corners, rounded; star: arms
+    omega: float = 0.0
+
+
+class WallsTable(Table):
+    """Rigid no-slip walls that enclose the fluid, and what drives it: turning walls, or flow through a channel's ends.
+
+    circle: radius, omega. couette: radius, inner_radius, omega, inner_omega. channel: along x, length from end to end, width W (half,
+    as of Poiseuille flow), u_max. file: text with two columns, a blank line between closed curves, the outer wall first; omega.
+    Strength by capillary instead of omega or u_max: of the rate that defines t_gamma (biem.scene.walls).
+    """
+
+    kind: Literal["circle", "couette", "channel", "file"]
+    radius: float | None = Field(None, gt=0)
+    inner_radius: float | None = Field(None, gt=0)
+    omega: float | None = None
+    inner_omega: float | None = None
+    length: float | None = Field(None, gt=0)
+    width: float | None = Field(None, gt=0)
+    u_max: float | None = None
+    capillary: float | None = None
+    file: str | None = None
+    spacing: float | None = Field(None, gt=0)  # of the nodes on the walls, at most; default vesicles' length / 32
+    obstacles: list[Obstacle] = Field([])
+
+
 class Time(Table):
     """dt, horizon and dt_min: numbers, or in units of the flow or of bending: "0.01 t_gamma", "2 t_kappa" (t_kappa = mu R^3 / kappa_b).
 
@@ -125,6 +159,7 @@ class Scene(Table):
     physics: Physics = Physics()
     vesicles: Vesicles = Vesicles()
     flow: FlowTable = FlowTable()
+    walls: WallsTable | None = None
     time: Time
     solver: Solver = Solver()
     output: Output = Output()

@@ -29,20 +29,21 @@ def required_parts(problem: Problem) -> list[Part]:
     """The parts of the solver for this scene, in the order in which a step uses them."""
     M = problem.X.shape[0]
     solver, output, time = problem.scene.solver, problem.scene.output, problem.scene.time
+    walled = problem.walls is not None
     many, flowing, split = M > 1, problem.flow.kind != "quiescent", solver.kind == "split"
-    moved = " and ".join(["the flow"] * flowing + ["the other vesicles"] * many)
+    moved = ", ".join(["the flow"] * flowing + ["the other vesicles"] * many + ["the walls' answer"] * walled)
     parts = [
         Part("relaxation", True, "bending is implicit: one dense solve a vesicle"),
         Part("background flow", flowing, f"flow {problem.flow.kind}" if flowing else "the fluid is at rest"),
     ]
     if split:
-        needed = many or flowing
-        parts.append(Part("advection", needed, f"the velocity of {moved} is made inextensible" if needed else "nothing moves the vesicle"))
+        needed = many or flowing or walled
+        parts.append(Part("advection", needed, f"the velocity by {moved} is made inextensible" if needed else "nothing moves the vesicle"))
     parts.append(
         Part(
             "tension",
-            many or output.tension,
-            "its force moves the other vesicles" if many else "asked for" if output.tension else "not asked for",
+            many or walled or output.tension,
+            "its force moves the other vesicles" if many else "the walls answer to its force" if walled else _asked(output.tension),
         )
     )
     how = "explicit, two sums a step" if split else "GMRES over pair sums"
@@ -52,16 +53,29 @@ def required_parts(problem: Problem) -> list[Part]:
         _near_field(problem) if many else Part("near field", False, "one vesicle"),
         Part(
             "repulsion",
-            many and solver.repulsion is not None,
+            (many or walled) and solver.repulsion is not None,
             f"where a gap is below {solver.repulsion.reach:g} lengths" if solver.repulsion else "not asked for",
         ),
         Part("area and length correction", "area_length" in solver.corrections, "solver.corrections"),
         Part("redistribution of nodes", "redistribute" in solver.corrections, "solver.corrections"),
         Part("extrapolation", time.order == 2, f"time.order = {time.order}"),
         Part("step size control", time.adaptive, f"time.tolerance = {time.tolerance:g}" if time.adaptive else "time.adaptive = false"),
-        Part("walls", False, "none in the scene"),
+        _walls(problem),
     ]
     return parts
+
+
+def _asked(wanted: bool) -> str:
+    return "asked for" if wanted else "not asked for"
+
+
+def _walls(problem: Problem) -> Part:
+    if problem.walls is None:
+        return Part("walls", False, "none in the scene")
+    how = "one explicit velocity" if problem.scene.solver.kind == "split" else "within GMRES"
+    bodies = len(problem.walls.curves) - 1
+    around = f"an outer wall and {bodies} bodies" if bodies else "an outer wall"
+    return Part("walls", True, f"{around}, {len(problem.walls.nodes)} nodes, factorised once: {how}")
 
 
 def _near_field(problem: Problem) -> Part:
@@ -95,12 +109,15 @@ def memory_estimate(problem: Problem) -> float:
     near_pairs = M * N  # one close neighbour for every node
     extent = np.ptp(problem.X, axis=(0, 2))
     far = far_field_bytes(M * N, M, N, _scheme(problem), solver.tolerances[1], (float(extent[0]), float(extent[1]))) if M > 1 else 0.0
+    if problem.walls is not None:
+        P = len(problem.walls.nodes)
+        far += 8.0 * 3 * (2 * P) ** 2 + 16.0 * sum(X.shape[1] ** 2 for X in problem.walls.curves)  # the inverse while it is made
     if solver.kind == "split":
         chunk = min(M * n**2, threads() * CPU_CHUNK if solver.device in ("cpu", "torch") else DEVICE_CHUNK)
-        factors = size * M * n**2 if M > 1 or problem.flow.kind != "quiescent" else 0.0
+        factors = size * M * n**2 if M > 1 or problem.flow.kind != "quiescent" or problem.walls is not None else 0.0
         return factors + 12 * 8.0 * chunk + 8.0 * (24 * M * 2 * n + 40 * M * 2 * N + 16 * near_pairs) + far
     one_chunk = 16 * (2 * n) ** 2  # operators of the vesicles in work
-    if M == 1:
+    if M == 1 and problem.walls is None:
         return 8.0 * one_chunk
     response = M * (2 * N) * (5 * N)
     krylov = 2 * M * N * 40
@@ -111,5 +128,5 @@ def trajectory_bytes(problem: Problem) -> float:
     """Size of the trajectory file; of adaptive runs, if all steps are as long as the first one."""
     M, _, N = problem.X.shape
     frames = problem.steps // problem.scene.time.save_every + 2
-    with_tension = M > 1 or problem.scene.output.tension
+    with_tension = M > 1 or problem.walls is not None or problem.scene.output.tension
     return 8.0 * frames * M * N * (3 if with_tension else 2)

@@ -29,6 +29,7 @@ from biem.steppers.stepper import Flow, State, StepResult
 from biem.stokes.interaction import DEFAULT_FIELDS, Fields, Interaction
 from biem.stokes.kress import on_own_curve
 from biem.stokes.near_search import minimum_gap
+from biem.stokes.walls import Walls
 
 CHUNK_VALUES = 1 << 16  # matrix entries per operator of one chunk of vesicles: they stay in the cache
 
@@ -38,7 +39,8 @@ class ImplicitStepper:
     """Parameters of the step. flow: background velocity, or None in a fluid at rest.
 
     points: nodes of the operators (default 2 N below N = 96); tolerance: GMRES, relative; tension: keep sigma also where no other vesicle
-    needs it. The repulsion is taken at X^n, as a background velocity.
+    needs it. The repulsion is taken at X^n, as a background velocity. Walls are part of the coupling: O includes their answer to a force,
+    by their factorised equations, so that no flow passes them at any iteration.
     """
 
     kappa_b: float
@@ -50,18 +52,20 @@ class ImplicitStepper:
     fields: Fields = DEFAULT_FIELDS
     repulsion: Repulsion | None = None
     tension: bool = False
+    walls: Walls | None = None
 
     def step(self, state: State, dt: float) -> StepResult:
         """The state at t + dt. Raises NumericalFailure if GMRES does not reach the tolerance."""
         with one_blas_thread():
-            return self._step_alone(state, dt) if state.X.shape[0] == 1 else self._step_coupled(state, dt)
+            alone = state.X.shape[0] == 1 and self.walls is None
+            return self._step_alone(state, dt) if alone else self._step_coupled(state, dt)
 
     def _step_coupled(self, state: State, dt: float) -> StepResult:
         X = state.X
         u_inf = 0.0 * X if self.flow is None else self.flow(X, state.t)
         with stage("response"):
             response = self._response(X, dt)
-        coupling = Interaction.build(X, self.mu, self.fields, stored=True)
+        coupling = Interaction.build(X, self.mu, self.fields, stored=True, walls=self.walls)
         repulsive = None if self.repulsion is None else self.repulsion.force(X)
         if repulsive is not None:
             u_inf = u_inf + on_own_curve(X, repulsive, self.mu) + coupling.velocity(repulsive)

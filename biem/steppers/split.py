@@ -24,6 +24,7 @@ from biem.ranks import ALONE, Ranks
 from biem.steppers.stepper import Flow, State, StepResult
 from biem.stokes.interaction import DEFAULT_FIELDS, Fields, Interaction
 from biem.stokes.kress import on_own_curve
+from biem.stokes.walls import Walls
 
 FIRST_SWEEPS, FIRST_CHANGE = 20, 1e-6  # of the fixed-point iteration at the start: at most, until the relative change is below
 
@@ -41,9 +42,10 @@ class _Advection:
 
 @dataclass(frozen=True)
 class SplitStepper:
-    """Parameters of the step. flow: background velocity, or None in a fluid at rest.
+    """Parameters of the step. flow: background velocity, or None in a fluid at rest; walls: their answer is one more explicit velocity.
 
-    tension: keep sigma also where no other vesicle needs it; ranks: processes that share the vesicles.
+    tension: keep sigma also where no other vesicle needs it; ranks: processes that share the vesicles; interacting: whether the vesicles
+    are in one fluid, or each in a fluid of its own, a batch of independent runs.
     """
 
     maps: MembraneMaps
@@ -54,6 +56,8 @@ class SplitStepper:
     repulsion: Repulsion | None = None
     tension: bool = False
     ranks: Ranks = ALONE
+    interacting: bool = True
+    walls: Walls | None = None
     _advection: Latest = field(default_factory=Latest, init=False, repr=False, compare=False)
 
     def step(self, state: State, dt: float) -> StepResult:
@@ -75,7 +79,7 @@ class SplitStepper:
             return self.ranks.gather(M, lambda mine: self.maps.relax(X[mine], dt))
 
     def _advect(self, state: State, dt: float) -> _Advection:
-        if self.flow is None and state.X.shape[0] == 1:
+        if self.flow is None and not self._coupled(state.X):
             return _Advection(state.X, sigma=-self.maps.self_tension(state.X) if self.tension else None)
         if state.coupling is not None:
             return self._evaluate(state)
@@ -95,7 +99,8 @@ class SplitStepper:
             u_inf = u_inf + on_own_curve(X, repulsive, self.mu)
         sigma = None
         u = u_inf
-        if M > 1 or self.tension:
+        coupled = self._coupled(X)
+        if coupled or self.tension:
             with stage("self-tension"):
                 self_tension = gather(lambda mine: self.maps.self_tension(X_mine))
 
@@ -103,9 +108,9 @@ class SplitStepper:
                 with stage("flow tension"):
                     return -(self_tension + gather(lambda mine: self.maps.flow_tension(X_mine, u[mine])))
 
-        if M > 1:
+        if coupled:
             own_force = bending_force(X, self.kappa_b) + (0.0 if repulsive is None else repulsive)
-            interaction = Interaction.build(X, self.mu, self.fields, self.ranks.mine(M))
+            interaction = Interaction.build(X, self.mu, self.fields, self.ranks.mine(M), walls=self.walls)
             velocity = lambda sigma: u_inf + gather(lambda mine: interaction.velocity(own_force + tension_force(X, sigma)))
             if state.coupling is None:
                 u, sigma = _fixed_point(tension, velocity, u_inf)
@@ -117,6 +122,10 @@ class SplitStepper:
             sigma = tension(u)
         rate = 0.0 * u if state.coupling is None else (u - state.coupling[1]) / (state.t - state.coupling[0])
         return _Advection(X_mine, u, rate, sigma, repulsive)
+
+    def _coupled(self, X: Array) -> bool:
+        """Whether a vesicle's force comes back to a vesicle: from another one, or from the walls."""
+        return self.walls is not None or (self.interacting and X.shape[0] > 1)
 
 
 def _fixed_point(tension: Callable[[Array], Array], velocity: Callable[[Array], Array], u: Array) -> tuple[Array, Array]:

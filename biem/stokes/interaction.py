@@ -1,4 +1,7 @@
-"""Velocity of vesicles due to all others, on their own nodes: pair sum plus near-field correction, for a fixed geometry. X: (M, 2, N)."""
+"""Velocity of vesicles due to all others, on their own nodes: pair sum plus near-field correction, for a fixed geometry. X: (M, 2, N).
+
+Where there are walls, also the flow by which they answer to the vesicles, own ones included, so that the fluid rests on them.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ from biem.stokes.near_layers import METHODS, NearLayers
 from biem.stokes.near_search import NearPairs, find_near
 from biem.stokes.near_sums import NearSums
 from biem.stokes.single_layer import near_scheme
+from biem.stokes.walls import Walls
 
 
 @dataclass(frozen=True)
@@ -56,31 +60,39 @@ class NearRows:
 
 @dataclass(frozen=True)
 class Interaction:
-    """Velocity (m, 2, N) of the vesicles `mine` due to all others."""
+    """Velocity (m, 2, N) of the vesicles `mine` due to all others, and to the walls' answer to all."""
 
     weights: Array
     far: PairSum
     near: tuple[Correction, ...]
-    count: int
+    nodes: Array  # of the vesicles `mine` (m N, 2)
     precision: str
+    walls: Walls | None = None
 
     @classmethod
-    def build(cls, X: Array, mu: float, fields: Fields, mine: slice = slice(None), stored: bool = False) -> Interaction:
+    def build(
+        cls, X: Array, mu: float, fields: Fields, mine: slice = slice(None), stored: bool = False, walls: Walls | None = None
+    ) -> Interaction:
         """For vesicles X (M, 2, N); stored: keep the near rows, as an iterative solver needs them."""
         xp = array_namespace(X)
         M, _, N = X.shape
         index = np.arange(M)[mine]
-        targets = xp.reshape(xp.permute_dims(X[mine], (0, 2, 1)), (len(index) * N, 2))
-        owner = from_numpy(np.repeat(index, N), like=X)
+        nodes = targets = xp.reshape(xp.permute_dims(X[mine], (0, 2, 1)), (len(index) * N, 2))
+        owner = np.repeat(index, N)
+        if walls is not None:
+            targets = xp.concat([targets, from_numpy(walls.nodes, like=X)])
+            owner = np.concatenate([owner, np.full(len(walls.nodes), -1)])
+        owner = from_numpy(owner, like=X)
         dtype = getattr(xp, fields.precision)
         origin = xp.mean(X, axis=(0, 2))  # subtracted before the precision is lowered
         lower = lambda a: xp.astype(a, dtype, copy=False)
         with stage("far"):
             points = lower(targets - origin), lower(X - origin[None, :, None])
-            far = pair_sum(*points, mu=mu, exclude=owner, far_field=fields.far_field, tolerance=fields.far_tolerance, of=M * N)
+            of = M * N + targets.shape[0] - nodes.shape[0]
+            far = pair_sum(*points, mu=mu, exclude=owner, far_field=fields.far_field, tolerance=fields.far_tolerance, of=of)
         with stage("near"):
             near = _near(X, targets, owner, mu, fields, stored)
-        return cls(arclength_weights(X)[:, None, :], far, near, len(index), fields.precision)
+        return cls(arclength_weights(X)[:, None, :], far, near, nodes, fields.precision, walls)
 
     def velocity(self, f: Array) -> Array:
         """(m, 2, N) for force densities f (M, 2, N) of all vesicles."""
@@ -91,7 +103,11 @@ class Interaction:
         with stage("near"):
             for correction in self.near:
                 u = correction.add(u, f)
-        return xp.permute_dims(xp.reshape(u, (self.count, f.shape[-1], 2)), (0, 2, 1))
+        if self.walls is not None:
+            P = self.nodes.shape[0]
+            with stage("walls"):
+                u = u[:P] + self.walls.answer(self.nodes, u[P:])
+        return xp.permute_dims(xp.reshape(u, (-1, f.shape[-1], 2)), (0, 2, 1))
 
 
 def _near(X: Array, targets: Array, owner: Array, mu: float, fields: Fields, stored: bool) -> tuple[Correction, ...]:

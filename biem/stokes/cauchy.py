@@ -1,0 +1,141 @@
+"""Double layer of one closed curve at any distance from it, to the accuracy of its nodes, through Cauchy integrals.
+
+In complex notation (w on the curve, n its outward normal, tau the density, z the target), with C[f](z) = 1/(2 pi i) int f dw/(w - z),
+
+    u = -1/2 C[tau] + conj( -1/2 C[conj(tau) + tau conj(n)/n] + 1/2 (conj(z) C[tau]' - C[conj(w) tau]') ).
+
+Each C[f] is holomorphic on either side of the curve; its boundary values v_k at the nodes come from the singular integral with the
+singularity subtracted (a fixed matrix), and its values and derivatives at targets from the barycentric quotients
+
+    v(z) = sum_k v_k q_k / S,   v'(z) = sum_k (v_k - v(z)) q_k/(w_k - z) / S,   q_k = w'_k/(w_k - z),   S = sum_k q_k   inside,
+    S = (z - a) sum_k q_k/(w_k - a)   outside, with any a inside the curve.
+
+Helsing & Ojala, J. Comput. Phys. 227 (2008); Barnett, Wu & Veerapaneni, SIAM J. Sci. Comput. 37 (2015).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import pi
+
+import numpy as np
+from array_api_compat import array_namespace, device
+
+from biem.backend import Array, compiled, from_numpy, on_cpu, to_numpy
+from biem.curves.curve import dot
+from biem.curves.fourier import derivative, differentiation_matrix
+from biem.stokes.kernels import double_layer
+
+NEAR = 8.0  # node spacings: beyond, the trapezoid rule errs by exp(-2 pi NEAR), more on the hollow side of a bend
+CHUNK = 1 << 20  # pairs of one temporary
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One closed counterclockwise curve X (2, N), seen by targets inside or outside of it; a (2,): a point inside the curve."""
+
+    X: np.ndarray
+    inside: bool
+    a: np.ndarray
+
+    @cached_property
+    def center(self) -> np.ndarray:
+        """Origin of the complex plane (2, 1)."""
+        return self.X.mean(axis=-1, keepdims=True)
+
+    @cached_property
+    def X_alpha(self) -> np.ndarray:
+        return derivative(self.X - self.center)
+
+    @cached_property
+    def speed(self) -> np.ndarray:
+        return np.hypot(*self.X_alpha)
+
+    @cached_property
+    def ds(self) -> np.ndarray:
+        """Arclength weights (N,)."""
+        return self.speed * (2.0 * pi / self.X.shape[-1])
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """Outward (2, N)."""
+        return np.stack([self.X_alpha[1], -self.X_alpha[0]]) / self.speed
+
+    @cached_property
+    def curvature(self) -> np.ndarray:
+        x_aa, y_aa = derivative(self.X_alpha)
+        return (self.X_alpha[0] * y_aa - self.X_alpha[1] * x_aa) / self.speed**3
+
+    @cached_property
+    def w(self) -> np.ndarray:
+        """Nodes about the centre, complex (N,)."""
+        return _complex(self.X - self.center)
+
+    @cached_property
+    def boundary_values(self) -> np.ndarray:
+        """(N, N): f -> the limit of C[f] at the nodes from the targets' side."""
+        N = len(self.w)
+        w_alpha = _complex(self.X_alpha)
+        r = self.w[None, :] - self.w[:, None]
+        np.fill_diagonal(r, 1.0)
+        quotient = w_alpha[None, :] / r
+        np.fill_diagonal(quotient, 0.0)
+        rows = (quotient - np.diag(quotient.sum(axis=1)) + differentiation_matrix(N)) / (1j * N)
+        return rows + np.eye(N) if self.inside else rows
+
+    def holomorphic(self, tau: np.ndarray) -> np.ndarray:
+        """Boundary values (3, N) of the Cauchy integrals of tau, conj(tau) + tau conj(n)/n and conj(w) tau, for tau (2, N)."""
+        t, n = _complex(tau), _complex(self.normal)
+        densities = np.stack([t, t.conj() + t * n.conj() / n, self.w.conj() * t], axis=1)
+        return np.ascontiguousarray((self.boundary_values @ densities).T)
+
+    def velocity(self, points: Array, tau: np.ndarray) -> Array:
+        """D[tau] (P, 2) at points (P, 2) on the curve's side of the targets. tau: (2, N)."""
+        reach = (NEAR * self.ds) ** 2
+        arrays = [self.X - self.center, self.normal, self.ds * tau, self.w, _complex(self.X_alpha), self.holomorphic(tau), reach]
+        a = complex(*(self.a - self.center[:, 0]))
+        x = points - from_numpy(self.center[:, 0], like=points)
+        if on_cpu(points):
+            loop = compiled("biem.stokes.cauchy_loop").velocity
+            return from_numpy(loop(np.ascontiguousarray(to_numpy(x)), *arrays, self.inside, a), like=points)
+        return velocity_of_arrays(x, [from_numpy(f, like=points) for f in arrays], self.inside, a)
+
+
+def velocity_of_arrays(x: Array, arrays: Sequence[Array], inside: bool, a: complex) -> Array:
+    """D (P, 2) at x (P, 2) in chunks of targets, for any array library and device; `cauchy_loop.velocity` is the same compiled.
+
+    arrays: nodes Y, normal, g = tau ds, each (2, N); w, w_alpha (N,); boundary values v (3, N); reach (N,), the squared distance below
+    which v is used.
+    """
+    Y, normal, g, w, w_alpha, v, reach = arrays
+    xp = array_namespace(x)
+    u = xp.empty_like(x)
+    step = max(1, CHUNK // Y.shape[-1])
+    for start in range(0, x.shape[0], step):
+        part = slice(start, start + step)
+        r = x[part, :, None] - Y
+        D_xx, D_xy, D_yy = double_layer(r[:, 0], r[:, 1], normal[0], normal[1])
+        far = xp.stack([xp.sum(D_xx * g[0] + D_xy * g[1], axis=-1), xp.sum(D_xy * g[0] + D_yy * g[1], axis=-1)], axis=-1)
+        near = xp.any(dot(r, r) < reach, axis=-1)
+        z = x[part][near]
+        far[near] = _close(xp.asarray(z[:, 0] + 1j * z[:, 1], device=device(x)), w, w_alpha, v, inside, a)
+        u[part] = far
+    return u
+
+
+def _close(z: Array, w: Array, w_alpha: Array, v: Array, inside: bool, a: complex) -> Array:
+    xp = array_namespace(z)
+    r = w[None, :] - z[:, None]
+    q = w_alpha / r
+    S = xp.sum(q, axis=-1) if inside else (z - a) * xp.sum(q / (w - a), axis=-1)
+    v_z = xp.sum(v[:, None, :] * q, axis=-1) / S  # (3, P)
+    of_z = xp.conj(z)[:, None] * (v[0][None, :] - v_z[0][:, None]) - (v[2][None, :] - v_z[2][:, None])
+    slope = xp.sum(of_z * q / r, axis=-1) / S
+    u = -0.5 * v_z[0] + xp.conj(0.5 * slope - 0.5 * v_z[1])
+    return xp.stack([xp.real(u), xp.imag(u)], axis=-1)
+
+
+def _complex(f: np.ndarray) -> np.ndarray:
+    return f[0] + 1j * f[1]
