@@ -16,7 +16,7 @@ from biem.curves.fourier import remove_nyquist, resample
 from biem.curves.reparam import redistribute
 from biem.curves.shapes import curve_of_angle
 
-FINE = 4096  # nodes on which shapes are made before they are resampled
+FINE = 4096  # nodes on which shapes are made, and brought to equal arclength, before they are resampled
 ROUNDING = 0.12  # of corners: standard deviation of the curvature's profile, in sides
 END_ROUNDING = 0.12  # of channels: the same, in lengths of the semicircle
 
@@ -80,7 +80,8 @@ def _scaled(X: np.ndarray, N: int, size: float) -> np.ndarray:
 
 def resampled(X: np.ndarray, N: int) -> np.ndarray:
     """N nodes equally spaced in arclength on the curve X (2, n)."""
-    return remove_nyquist(resample(redistribute(X[None])[0][0], N))
+    fine = resample(X, max(FINE, X.shape[-1]))
+    return remove_nyquist(resample(redistribute(fine[None])[0][0], N))
 
 
 def nodes_for(X: np.ndarray, spacing: float, least: int) -> int:

@@ -61,29 +61,21 @@ class Problem:
 
 def build(scene: Scene) -> Problem:
     """The problem of a scene. Raises ValueError with one line for what is wrong."""
-    v = scene.vesicles
-    from_file = None if v.file is None else _from_file(scene)
-    if from_file is None:
-        radius, one = v.length * np.sqrt(v.reduced_area) / (2 * np.pi), v.length
-    else:
-        radius, one = float(np.sqrt(np.mean(area(from_file[0])) / np.pi)), float(np.mean(length(from_file[0])))
-    walls, region = None, None
-    if scene.walls is None:
-        flow = _flow(scene, radius)
-    else:
-        if scene.flow != FlowTable():
-            raise ValueError("[walls] drive the flow between them: remove [flow]")
-        spacing = one / WALL_NODES_PER_LENGTH
-        walls, flow = make_walls(scene.walls, scene.physics.mu, scene.physics.kappa_b, radius, spacing, scene.folder)
-        region = fluid_region(walls.curves)
-    X, notices = from_file or (_membranes(scene, region), ())
+    X, notices = (None, ()) if scene.vesicles.file is None else _from_file(scene)
+    walls, region, flow = (None, None, None) if scene.walls is None else _between_walls(scene, X)
+    if X is None:
+        X = _membranes(scene, region)
     _check_membranes(X, region)
-    if flow.kind == "rotation":
-        _check_rotation(X)
+    radius = float(np.sqrt(np.mean(area(X)) / np.pi))
+    if flow is None:
+        flow = _flow(scene, radius)
+        if flow.kind == "rotation":
+            _check_rotation(X)
     t_kappa = scene.physics.mu * radius**3 / scene.physics.kappa_b
     units = {"t_gamma": flow.time_scale, "t_kappa": t_kappa}
     dt, dt_min, horizon = _times(scene, units)
-    flow.velocity(X, 0.0)  # a custom flow shows here what is wrong with it
+    if flow.kind == "custom":
+        flow.velocity(X, 0.0)  # it shows here what is wrong with it
     _check_solver(scene)
     points = scene.solver.operator_points
     if points is not None and points < X.shape[-1]:
@@ -129,6 +121,18 @@ def _times(scene: Scene, units: dict[str, float | None]) -> tuple[float, float, 
                 "GMRES tolerance of a step: choose a larger one"
             )
     return dt, dt_min, horizon
+
+
+def _between_walls(scene: Scene, X: np.ndarray | None) -> tuple[Walls, shapely.Polygon, BackgroundFlow]:
+    """Walls, the fluid between them and what drives it. X: the membranes, where they are known already."""
+    if scene.flow != FlowTable():
+        raise ValueError("[walls] drive the flow between them: remove [flow]")
+    assert scene.walls is not None
+    if X is None:
+        X = _shape(scene.vesicles, np.random.default_rng(scene.vesicles.seed))[None]
+    radius, spacing = float(np.sqrt(np.mean(area(X)) / np.pi)), float(np.mean(length(X))) / WALL_NODES_PER_LENGTH
+    walls, flow = make_walls(scene.walls, scene.physics.mu, scene.physics.kappa_b, radius, spacing, scene.folder)
+    return walls, fluid_region(walls.curves), flow
 
 
 def _membranes(scene: Scene, region: shapely.Polygon | None) -> np.ndarray:

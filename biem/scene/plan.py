@@ -74,7 +74,7 @@ def _walls(problem: Problem) -> Part:
         return Part("walls", False, "none in the scene")
     how = "one explicit velocity" if problem.scene.solver.kind == "split" else "within GMRES"
     bodies = len(problem.walls.curves) - 1
-    around = f"an outer wall and {bodies} bodies" if bodies else "an outer wall"
+    around = "an outer wall" + (f" and {bodies} {'body' if bodies == 1 else 'bodies'}" if bodies else "")
     return Part("walls", True, f"{around}, {len(problem.walls.nodes)} nodes, factorised once: {how}")
 
 

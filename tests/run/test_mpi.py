@@ -33,6 +33,7 @@ WAYS = {
     "order 1": {},
     "order 2": {"time": {"order": 2}},
     "adaptive": {"time": {"adaptive": True, "tolerance": 1e-5, "horizon": 3 * DT}},
+    "walls": {"flow": {"kind": None, "rate": None}, "walls": {"kind": "circle", "radius": 1.5, "omega": 100.0, "spacing": 0.2}},
 }
 
 # Flows that go wrong on the second process alone, at the start or after two steps.
@@ -105,7 +106,9 @@ def assert_close_frames(a, b, scale=1.0):
     assert np.abs(a.sigma - b.sigma).max() < 1e-10 * np.abs(b.sigma).max()
 
 
-@pytest.mark.parametrize(("processes", "way"), [(1, "order 1"), (2, "order 1"), (2, "order 2"), (2, "adaptive"), (3, "adaptive")])
+@pytest.mark.parametrize(
+    ("processes", "way"), [(1, "order 1"), (2, "order 1"), (2, "order 2"), (2, "adaptive"), (3, "adaptive"), (2, "walls")]
+)
 def test_any_number_of_processes_gives_the_trajectory_of_one_and_speaks_once(tmp_path, processes, way):
     path, out = write_scene(tmp_path, TEN, WAYS[way]), tmp_path / "out.h5"
     exit_code, printed, bars = mpi(processes, "run", path, "-o", out)

@@ -38,6 +38,24 @@ REFUSED = {
     "flow.width": "0 | -1",
     "flow.confinement": "0 | inf",
     "flow.function": "3",
+    "walls.kind": '"box"',
+    "walls.radius": '0 | -1.0 | "1"',
+    "walls.inner_radius": "0",
+    "walls.omega": 'nan | "fast"',
+    "walls.inner_omega": "inf",
+    "walls.length": "0",
+    "walls.width": "-1.0",
+    "walls.u_max": "nan",
+    "walls.capillary": "inf",
+    "walls.file": "3",
+    "walls.spacing": "0",
+    "walls.obstacles.shape": '"cube"',
+    "walls.obstacles.center": "[0.0] | 1.0",
+    "walls.obstacles.size": "0 | nan",
+    "walls.obstacles.angle": '"up"',
+    "walls.obstacles.aspect": "0.0 | 1.5",
+    "walls.obstacles.sides": "2 | 3.5",
+    "walls.obstacles.omega": "nan",
     "time.dt": '0 | -1e-4 | nan | inf | true | [1] | "0.01 furlongs" | "t_gamma" | "1 2 t_gamma" | "" | "-1 t_gamma" | "nan"',
     "time.horizon": '0 | -1.0 | "inf t_kappa" | inf',
     "time.save_every": "0 | 2.5",
@@ -75,6 +93,16 @@ def schema(model=Scene, prefix=""):
             yield prefix + name
 
 
+def setting(key, value):
+    """The override of a key, also of one in a list of tables."""
+    return f"walls.obstacles=[{{{key.split('.')[-1]}={value}}}]" if key.startswith("walls.obstacles.") else f"{key}={value}"
+
+
+def in_list(key):
+    """The key as an error names it."""
+    return key.replace("walls.obstacles.", "walls.obstacles.0.")
+
+
 def refusal(path, *overrides):
     with pytest.raises(ValueError) as caught:
         build(load_scene(path, overrides))
@@ -85,7 +113,7 @@ def refusal(path, *overrides):
 
 @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in REFUSED.items() for value in values.split(" | ")])
 def test_bad_value_is_refused_with_its_key(tmp_path, key, value):
-    assert key in refusal(write_scene(tmp_path), f"{key}={value}")
+    assert in_list(key) in refusal(write_scene(tmp_path), setting(key, value))
 
 
 def test_every_key_of_the_schema_has_bad_values_above():
@@ -95,8 +123,8 @@ def test_every_key_of_the_schema_has_bad_values_above():
 @pytest.mark.parametrize("key", sorted(schema()))
 def test_misspelt_key_names_its_path_and_the_nearest_key(tmp_path, key):
     wrong = key + key[-1]
-    message = refusal(write_scene(tmp_path), f"{wrong}=1")
-    hint = message.partition(f"unknown key {wrong}: ")[2]
+    message = refusal(write_scene(tmp_path), setting(wrong, 1))
+    hint = message.partition(f"unknown key {in_list(wrong)}: ")[2]
     assert re.search(rf"did you mean {key.split('.')[-1]}\?", hint), message
 
 

@@ -1,7 +1,6 @@
 """Walls against exact flows between cylinders and in a channel; loads; convergence; no flow through them."""
 
 import numpy as np
-import pytest
 import torch
 from helpers import circle, ellipse, nodes, rotate
 
