@@ -182,6 +182,11 @@ def one_blas_thread() -> Any:
     return _blas().limit(limits=1)
 
 
+def all_blas_threads() -> Any:
+    """Context with BLAS on all threads, for one large matrix, also within `one_blas_thread`."""
+    return _blas().limit(limits=threads())
+
+
 def shares(start: int, stop: int, least: int, most: int) -> list[slice]:
     """[start, stop) in slices of nearly one size, at most `most`: a whole number for every thread where none is below `least` then."""
     count = max(1, stop - start)

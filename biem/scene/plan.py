@@ -111,7 +111,7 @@ def memory_estimate(problem: Problem) -> float:
     far = far_field_bytes(M * N, M, N, _scheme(problem), solver.tolerances[1], (float(extent[0]), float(extent[1]))) if M > 1 else 0.0
     if problem.walls is not None:
         P = len(problem.walls.nodes)
-        far += 8.0 * 3 * (2 * P) ** 2 + 16.0 * sum(X.shape[1] ** 2 for X in problem.walls.curves)  # the inverse while it is made
+        far += 8.0 * 2 * (2 * P) ** 2 + 16.0 * sum(X.shape[1] ** 2 for X in problem.walls.curves)  # the equations while they are made
     if solver.kind == "split":
         chunk = min(M * n**2, threads() * CPU_CHUNK if solver.device in ("cpu", "torch") else DEVICE_CHUNK)
         factors = size * M * n**2 if M > 1 or problem.flow.kind != "quiescent" or problem.walls is not None else 0.0

@@ -7,9 +7,11 @@ In complex notation (w on the curve, n its outward normal, tau the density, z th
 Each C[f] is holomorphic on either side of the curve; its boundary values v_k at the nodes come from the singular integral with the
 singularity subtracted (a fixed matrix), and its values and derivatives at targets from the barycentric quotients
 
-    v(z) = sum_k v_k q_k / S,   v'(z) = sum_k (v_k - v(z)) q_k/(w_k - z) / S,   q_k = w'_k/(w_k - z),   S = sum_k q_k   inside,
-    S = (z - a) sum_k q_k/(w_k - a)   outside, with any a inside the curve.
+    v(z) = c(z) sum_k (v_k/c_k) p_k / S,      v'(z) = c(z) sum_k (v_k - v(z))/(w_k - z) p_k/c_k / S,
+    p_k = c_k w'_k/(w_k - z),   S = sum_k p_k
 
+with c = 1 inside and c(z) = 1/(z - a) outside, for any a inside the curve. Both are taken from the closest node on, so that no digits are
+lost next to it.
 Helsing & Ojala, J. Comput. Phys. 227 (2008); Barnett, Wu & Veerapaneni, SIAM J. Sci. Comput. 37 (2015).
 """
 
@@ -128,11 +130,19 @@ def velocity_of_arrays(x: Array, arrays: Sequence[Array], inside: bool, a: compl
 def _close(z: Array, w: Array, w_alpha: Array, v: Array, inside: bool, a: complex) -> Array:
     xp = array_namespace(z)
     r = w[None, :] - z[:, None]
-    q = w_alpha / r
-    S = xp.sum(q, axis=-1) if inside else (z - a) * xp.sum(q / (w - a), axis=-1)
-    v_z = xp.sum(v[:, None, :] * q, axis=-1) / S  # (3, P)
-    of_z = xp.conj(z)[:, None] * (v[0][None, :] - v_z[0][:, None]) - (v[2][None, :] - v_z[2][:, None])
-    slope = xp.sum(of_z * q / r, axis=-1) / S
+    c, c_z = (xp.ones_like(w), xp.ones_like(z)) if inside else (1.0 / (w - a), 1.0 / (z - a))
+    closest = xp.argmin(xp.real(r) ** 2 + xp.imag(r) ** 2, axis=-1)
+    V = v / c
+    p = c * w_alpha / r
+    S = xp.sum(p, axis=-1)
+    start = V[:, closest]  # (3, P)
+    change = xp.sum((V[:, None, :] - start[:, :, None]) * p, axis=-1) / S
+    v_z = c_z * (start + change)
+    from_z = v[:, None, :] - v_z[:, :, None]
+    jump = 0.0 * c_z if inside else (z - w[closest]) * c[closest] * c_z  # c at the node less c(z)
+    from_z[:, xp.arange(z.shape[0], device=device(z)), closest] = start * jump - c_z * change
+    of_z = xp.conj(z)[:, None] * from_z[0] - from_z[2]
+    slope = c_z * xp.sum(of_z * p / (c * r), axis=-1) / S
     u = -0.5 * v_z[0] + xp.conj(0.5 * slope - 0.5 * v_z[1])
     return xp.stack([xp.real(u), xp.imag(u)], axis=-1)
 

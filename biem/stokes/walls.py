@@ -9,7 +9,7 @@ with normals that point out of the fluid (the sign), and the force and torque of
     lambda_k = 4 pi mu/l_k int tau ds,      xi_k = 4 pi mu/l_k int tau.(x - c_k)^perp ds,      l_k its length.
 
 On the walls  -tau/2 + (principal value and the sources) + n int n.tau ds / l_0 = g,  the last term on the outer wall, where it lifts the
-null space: g has no net flux. Of the second kind, solved by one dense inverse. Power & Miranda, SIAM J. Appl. Math. 47 (1987).
+null space: g has no net flux. Of the second kind, factorised once. Power & Miranda, SIAM J. Appl. Math. 47 (1987).
 
 A plane flow past bodies that no outer wall surrounds has no solution in general (Stokes' paradox): the outer wall is obligatory.
 """
@@ -23,9 +23,10 @@ from math import pi
 
 import numpy as np
 from array_api_compat import array_namespace
+from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial import cKDTree
 
-from biem.backend import Array, count, from_numpy, to_numpy
+from biem.backend import Array, all_blas_threads, count, from_numpy, to_numpy
 from biem.stokes.cauchy import Curve
 from biem.stokes.kernels import double_layer, stokeslet
 from biem.stokes.near_search import locate
@@ -71,8 +72,8 @@ class Walls:
         return rows.reshape(-1, 3, 2 * P)
 
     @cached_property
-    def _inverse(self) -> np.ndarray:
-        """(2P, 2P): from boundary values [g_x; g_y] to the density."""
+    def _factors(self) -> tuple[np.ndarray, np.ndarray]:
+        """LU factors (2P, 2P) of the equations for [tau_x; tau_y]."""
         count("wall_factorization")
         P = len(self.nodes)
         A = np.empty((2, P, 2, P))
@@ -97,11 +98,12 @@ class Walls:
         weighted = np.zeros((2, P))
         weighted[:, self.slices[0]] = outer.normal * outer.ds / outer.ds.sum()
         A += np.outer(n.ravel(), weighted.ravel())
-        return np.linalg.inv(A)
+        with all_blas_threads():
+            return lu_factor(A, overwrite_a=True, check_finite=False)
 
     def density(self, g: np.ndarray) -> np.ndarray:
         """tau (P, 2) for the velocity g (P, 2) at the nodes; its net flux through the outer wall, if any, is left out."""
-        return (self._inverse @ g.T.ravel()).reshape(2, -1).T
+        return lu_solve(self._factors, g.T.ravel(), check_finite=False).reshape(2, -1).T
 
     def velocity(self, points: Array, tau: np.ndarray) -> Array:
         """u (Q, 2) at points (Q, 2) in the fluid, as close to the walls as may be, for the density tau (P, 2)."""

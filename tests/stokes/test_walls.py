@@ -34,7 +34,9 @@ def ring(radius, P=40):
     return radius * np.stack([np.cos(t), np.sin(t)], axis=1)
 
 
-BETWEEN = np.concatenate([ring(r) for r in (A + 1e-8, A + 1e-3, A + 0.1, 1.7, B - 0.1, B - 1e-3, B - 1e-8)])
+BETWEEN = np.concatenate(
+    [ring(r) for r in (A + 1e-8, A + 1e-3, A + 0.1, 1.7, B - 0.1, B - 1e-3, B - 1e-8)] + [np.array([[A + 1e-9, 0.0], [0.0, B - 1e-9]])]
+)
 
 
 def flow_at(walls, x):
