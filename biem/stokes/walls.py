@@ -108,11 +108,11 @@ class Walls:
     def velocity(self, points: Array, tau: np.ndarray) -> Array:
         """u (Q, 2) at points (Q, 2) in the fluid, as close to the walls as may be, for the density tau (P, 2)."""
         count("wall_velocity")
-        u = from_numpy(np.zeros(1), like=points) * points
+        xp = array_namespace(points)
+        u = xp.zeros_like(points)
         for k, (part, here) in enumerate(zip(self.parts, self.slices, strict=True)):
             of_wall = part.velocity(points, tau[here].T)
             u = u + of_wall if k == 0 else u - of_wall
-        xp = array_namespace(points)
         for source, moments in zip(self._sources(points), self._moments, strict=True):
             u = u + xp.matmul(source, from_numpy(moments @ tau.T.ravel(), like=points))
         return u
