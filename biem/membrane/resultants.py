@@ -74,7 +74,7 @@ class Resultants:
     def W(self) -> Array:
         """(M, n, n) with W^T W = G_tt^-1; the condition number of G_tt is about 0.75 n."""
         count("tension_matrix", self.X.shape[0])
-        return self._by_chunk(lambda part: part._tension_factor(part._strain_blocks(part._kernel())))
+        return self._by_chunk(lambda part: part.strain_matrices(part.kernel())[1])
 
     def velocity(self, q: Array) -> Array:
         """u (M, 2, n) of the resultant q (M, 2, n)."""
@@ -83,8 +83,16 @@ class Resultants:
 
     def flow_tension(self, u: Array) -> Array:
         """L^-1 P u (M, n): minus the tension that makes the velocity u (M, 2, n) inextensible."""
-        rate = self._working(dot(self.t, derivative(u)) / -self.h)
-        return self._exact(_matvec(_transpose(self.W), _matvec(self.W, rate)))
+        return self.tensions(self.rate(u)[..., None], self.W)[..., 0]
+
+    def rate(self, u: Array) -> Array:
+        """t . u_alpha (M, n), what the velocity u stretches by, times the speed."""
+        return dot(self.t, derivative(u))
+
+    def tensions(self, rates: Array, W: Array) -> Array:
+        """L^-1 P u (M, n, C) of C velocities by their rates (M, n, C)."""
+        xp = array_namespace(self.X)
+        return self._exact(xp.matmul(_transpose(W), xp.matmul(W, self._working(rates / -self.h))))
 
     def self_tension(self) -> Array:
         """L^-1 P B X (M, n)."""
@@ -97,15 +105,13 @@ class Resultants:
     def relaxation(self, dt: float) -> Array:
         """Z (M, 2, n) with Z/dt = (1 - M) B (X + Z), arclength frozen at X."""
         count("relaxation_matrix", self.X.shape[0])
-        q = self._by_chunk(lambda part: part._relaxed_resultant(dt))
+        q = self._by_chunk(lambda part: part.relaxed_resultant(dt, *part.strain_matrices(part.kernel())))
         return dt * self.velocity(q)
 
-    def _relaxed_resultant(self, dt: float) -> Array:
-        """Lambda t + Q n of X + Z (M, 2, n)."""
+    def relaxed_resultant(self, dt: float, G: Array, W: Array) -> Array:
+        """Lambda t + Q n of X + Z (M, 2, n), from the `strain_matrices`."""
         xp = array_namespace(self.X)
         t, n = self._working(self.t), self._working(self.n)
-        G = self._strain_blocks(self._kernel())
-        W = self._tension_factor(G)
         Y = xp.matmul(W, in_frame(G, t, n))
         Sigma = in_frame(G, n, n) - xp.matmul(_transpose(Y), Y)
         D = constant(differentiation_matrix, self.X.shape[-1], like=Sigma)
@@ -117,18 +123,17 @@ class Resultants:
         Lambda = -_matvec(_transpose(W), _matvec(Y, Q))
         return self._exact(Lambda)[:, None, :] * self.t + self._exact(Q)[:, None, :] * self.n
 
-    def _kernel(self) -> Array:
+    def kernel(self) -> Array:
+        """Blocks xx, xy, yy of K (M, 3, n, n), of all vesicles at once: for callers who take few."""
         return self._working(single_layer_kernel(self.local, self.X_alpha, self.mu))
 
-    def _strain_blocks(self, K: Array) -> Array:
-        """Blocks xx, xy, yy of G = D^T K D (M, 3, n, n)."""
+    def strain_matrices(self, K: Array) -> tuple[Array, Array]:
+        """Blocks xx, xy, yy of G = D^T K D (M, 3, n, n), and W."""
         xp = array_namespace(K)
         D = constant(differentiation_matrix, K.shape[-1], like=K)
-        return xp.matmul(-D, xp.matmul(K, D))
-
-    def _tension_factor(self, G: Array) -> Array:
+        G = xp.matmul(-D, xp.matmul(K, D))
         t = self._working(self.t)
-        return inverse_factor(in_frame(G, t, t))
+        return G, inverse_factor(in_frame(G, t, t))
 
     def _by_chunk(self, function: Callable[..., Array], *fields: Array) -> Array:
         """function(part, *fields of the part) over chunks of vesicles, joined."""
