@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -14,10 +12,10 @@ import typer
 from tqdm import tqdm
 
 from biem.backend import fft_backend
+from biem.cli import fail, first_rank_only, one_line_errors
 from biem.curves.curve import area, length
-from biem.errors import NumericalFailure
-from biem.ranks import ALONE, Ranks, world
-from biem.run.simulate import Stopped, simulate
+from biem.ranks import Ranks, world
+from biem.run.simulate import simulate
 from biem.run.solver import make_stepper, on_device
 from biem.run.trajectory import Trajectory, read_trajectory
 from biem.scene.build import Problem, build
@@ -31,29 +29,6 @@ ScenePath = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="S
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="Override a key: --set vesicles.points=32.", metavar="KEY=VALUE")]
 SolverName = Annotated[str | None, typer.Option("--solver", help="Override solver.kind.")]
 TrajectoryPath = Annotated[Path, typer.Argument(help="Trajectory (HDF5).", metavar="TRAJECTORY", show_default=False)]
-
-
-@contextmanager
-def one_line_errors(ranks: Ranks = ALONE) -> Iterator[None]:
-    """Errors that are the input's or the disk's end in one line, of the first rank, and an exit code, not in a traceback."""
-    try:
-        yield
-    except NumericalFailure as error:
-        _fail(str(error), 3, ranks)
-    except Stopped as stopped:
-        _fail(f"{stopped}; go on with --resume", 4, ranks)
-    except FileNotFoundError as error:
-        _fail(str(error), 2, ranks)
-    except OSError as error:
-        _fail(f"file error: {error}", 5, ranks)
-    except (ValueError, MemoryError) as error:
-        _fail(str(error), 2, ranks)
-
-
-def _fail(message: str, code: int, ranks: Ranks = ALONE) -> None:
-    if ranks.rank == 0:
-        typer.echo(f"error: {message}", err=True)
-    raise typer.Exit(code)
 
 
 @app.command()
@@ -88,7 +63,7 @@ def plan(
     overrides: Overrides = None,
 ) -> None:
     """Print what a scene requires, and why, with memory, file size and time."""
-    _first_rank_only()
+    first_rank_only()
     with one_line_errors():
         problem = build(_load(scene, solver, overrides))
         M, _, N = problem.X.shape
@@ -113,7 +88,7 @@ def plot(
     movie: Annotated[bool, typer.Option(help="Draw the movie.")] = True,
 ) -> None:
     """Draw frames, energies, errors and a movie."""
-    _first_rank_only()
+    first_rank_only()
     with one_line_errors():
         from biem.run.plot import draw_all  # matplotlib loads slowly: only where it is needed
 
@@ -127,20 +102,14 @@ def verify(trajectory: TrajectoryPath) -> None:
     """Check a trajectory file: schema, finite values, areas and lengths, crossings, energies."""
     from biem.run.verify import verify as check_all
 
-    _first_rank_only()
+    first_rank_only()
     with one_line_errors():
         checks = check_all(read_trajectory(trajectory))
         for check in checks:
             typer.echo(f"{'ok    ' if check.passed else 'FAILED'}  {check.name}: {check.detail}")
         failed = sum(not check.passed for check in checks)
         if failed:
-            _fail(f"{failed} of {len(checks)} checks failed on {trajectory}", 3)
-
-
-def _first_rank_only() -> None:
-    with one_line_errors():
-        if world().rank > 0:
-            raise typer.Exit
+            fail(f"{failed} of {len(checks)} checks failed on {trajectory}", 3)
 
 
 def _load(path: Path, solver: str | None, overrides: list[str] | None) -> Scene:

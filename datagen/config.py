@@ -86,7 +86,7 @@ class Label(Table):
     relaxation: Literal["implicit", "converged"] = "implicit"
     substeps: int = Field(16, ge=2)
     maps: list[MapName] = Field(list(MAPS), min_length=1)
-    modes: list[int] | None = None
+    modes: list[int] | None = Field(None, min_length=1)
     chunk: int = Field(256, ge=1)
 
 
@@ -110,4 +110,8 @@ def load_dataset(path: str | Path, overrides: Iterable[str] = ()) -> Dataset:
     path = Path(path)
     table = read_toml(path, "data set", "configs/datagen/smoke.toml", overrides)
     table.setdefault("name", path.stem)
-    return validated(Dataset, table, EXPECTED)
+    config = validated(Dataset, table, EXPECTED)
+    for key, points in (("shapes.points", config.shapes.points), ("label.operator_points", config.label.operator_points)):
+        if points < 2 * config.shapes.modes:
+            raise ValueError(f"{key} = {points} nodes do not hold shapes.modes = {config.shapes.modes} modes: take twice as many nodes")
+    return config

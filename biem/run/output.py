@@ -21,6 +21,7 @@ from biem.run.trajectory import Trajectory, TrajectoryWriter, exists, join, read
 from biem.scene.build import Problem
 from biem.scene.config import make_scene
 from biem.scene.plan import trajectory_bytes
+from biem.scene.tables import flat
 
 
 class Output:
@@ -99,22 +100,12 @@ def _start_files(problem: Problem, path: Path, start: Checkpoint, attributes: di
 
 def _check_same_scene(old: str, new: str) -> None:
     """A run may be resumed with a longer horizon and other output settings; nothing else may differ."""
-    a, b = (_flat(make_scene(json.loads(scene)).model_dump(mode="json")) for scene in (old, new))  # keys that came later: defaults
+    a, b = (flat(make_scene(json.loads(scene)).model_dump(mode="json")) for scene in (old, new))  # keys that came later: defaults
     free = ("time.horizon", "output.trajectory", "output.checkpoint_every")
     differ = [k for k in sorted(a.keys() | b.keys()) if a.get(k) != b.get(k) and not k.startswith(free)]
     if differ:
         what = "; ".join(f"{k} was {a.get(k)!r}, is {b.get(k)!r}" for k in differ[:4])
         raise ValueError(f"the checkpoint is of another scene: {what}; resume with the old values or start anew with --force")
-
-
-def _flat(table: dict, prefix: str = "") -> dict[str, object]:
-    flat: dict[str, object] = {}
-    for key, value in table.items():
-        if isinstance(value, dict):
-            flat.update(_flat(value, f"{prefix}{key}."))
-        else:
-            flat[prefix + key] = value
-    return flat
 
 
 def _check_space(problem: Problem, path: Path) -> None:

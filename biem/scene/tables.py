@@ -47,6 +47,17 @@ def validated(model: type[Model], table: Mapping[str, Any], expected: Mapping[st
         raise ValueError("; ".join(dict.fromkeys(_explain(e, model, expected or {}) for e in error.errors()))) from None
 
 
+def flat(table: Mapping[str, Any] | list[Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested tables and lists of tables by their paths, as in "walls.obstacles.0.size"."""
+    values: dict[str, Any] = {}
+    for key, value in table.items() if isinstance(table, Mapping) else enumerate(table):
+        if isinstance(value, Mapping) or (isinstance(value, list) and value and isinstance(value[0], Mapping)):
+            values.update(flat(value, f"{prefix}{key}."))
+        else:
+            values[f"{prefix}{key}"] = value
+    return values
+
+
 def _override(table: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     if not equals or not key.strip():

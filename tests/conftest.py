@@ -1,0 +1,35 @@
+"""Options and fixtures of several test files."""
+
+import sys
+
+import datagen_fakes
+import pytest
+
+
+def pytest_addoption(parser):
+    parser.addoption("--moments", type=int, default=4, help="random moments at which runs that make data are killed; 50 in full")
+
+
+def pytest_generate_tests(metafunc):
+    if "moment" in metafunc.fixturenames:
+        metafunc.parametrize("moment", range(metafunc.config.getoption("moments")))
+
+
+@pytest.fixture
+def config(tmp_path):
+    """The file of a data set for the fakes."""
+    return datagen_fakes.write_config(tmp_path)
+
+
+@pytest.fixture
+def whole(tmp_path, config, fakes):
+    """The folder of such a data set, finished."""
+    datagen_fakes.run("make", config, "-o", tmp_path / "whole", "--quiet")
+    return tmp_path / "whole"
+
+
+@pytest.fixture
+def fakes(monkeypatch):
+    """Stages that compute next to nothing in place of those of datagen."""
+    for name, module in datagen_fakes.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
