@@ -17,6 +17,7 @@ from biem.curves.reparam import redistribute
 from biem.curves.shapes import curve_of_angle
 
 FINE = 4096  # nodes on which shapes are made, and brought to equal arclength, before they are resampled
+MOST_NODES = 50_000  # of one wall; its equations are dense
 ROUNDING = 0.12  # of corners: standard deviation of the curvature's profile, in sides
 END_ROUNDING = 0.12  # of channels: the same, in lengths of the semicircle
 
@@ -85,5 +86,15 @@ def resampled(X: np.ndarray, N: int) -> np.ndarray:
 
 
 def nodes_for(X: np.ndarray, spacing: float, least: int) -> int:
-    """The even number of nodes, at least `least`, that are no further apart than `spacing` on the curve X (2, n)."""
-    return max(least, 2 * int(np.ceil(0.5 * float(length(X[None])[0]) / spacing)))
+    """The even number of nodes, at least `least`, that are no further apart than `spacing` on the curve X (2, n).
+
+    Raises ValueError for more than MOST_NODES.
+    """
+    perimeter = float(length(X[None])[0])
+    N = 2.0 * np.ceil(0.5 * perimeter / spacing)
+    if not N <= MOST_NODES:
+        raise ValueError(
+            f"a wall of length {perimeter:.3g} with nodes {spacing:.3g} apart needs {N:.3g} nodes: at most {MOST_NODES} are possible, "
+            "enlarge walls.spacing"
+        )
+    return max(least, int(N))

@@ -41,6 +41,8 @@ def check_machine(problem: Problem, ranks: Ranks = ALONE) -> None:
     if needed > free:
         M, _, N = problem.X.shape
         way = 'solver.kind = "split"' if problem.scene.solver.kind == "implicit" else 'solver.dtype = "float32"'
+        if problem.walls is not None:
+            way = f"a larger walls.spacing (the walls have {len(problem.walls.nodes)} nodes), or {way}"
         raise ValueError(
             f"a step of {M} vesicles of {N} nodes needs about {needed / 1e6:.3g} MB of memory, {free / 1e6:.3g} MB are free: take fewer "
             f"vesicles or nodes, or {way}"

@@ -137,6 +137,7 @@ def test_a_missing_file_is_refused(tmp_path):
         ({**CIRCLE, "radus": 2.0}, "did you mean radius"),
         ({**CIRCLE, "obstacles": [{**ROCK, "sise": 2.0}]}, "did you mean size"),
         ({"kind": "sphere"}, "walls.kind"),
+        ({**CIRCLE, "radius": 1e9}, "enlarge walls.spacing"),
     ],
 )
 def test_bad_tables_are_refused(walls, words):
@@ -175,3 +176,10 @@ def test_the_command_says_it_in_one_line(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text('[time]\ndt = 1.0\nhorizon = 1.0\n[walls]\nkind = "circle"\n')
     assert "needs walls.radius" in the_error(cli("plan", path), 2)
+
+
+def test_walls_that_the_memory_does_not_hold_are_refused_before_they_are_built(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text('[time]\ndt = 1.0\nhorizon = 1.0\n[walls]\nkind = "circle"\nradius = 1.0\nspacing = 2e-4\n[vesicles]\npoints = 16\n')
+    message = the_error(cli("run", path, "-o", tmp_path / "out.h5"), 2)
+    assert "a larger walls.spacing (the walls have 31416 nodes)" in message
