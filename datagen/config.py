@@ -56,7 +56,7 @@ class Simulation(Table):
     """How runs are computed. points: nodes of the membranes, or "adaptive": the fewest of 32, 64, 128, 256 that resolve the shape."""
 
     points: int | Literal["adaptive"] = "adaptive"
-    tolerance: float = Field(1e-5, gt=0, lt=1)  # adaptive: of the highest third of the shape's modes, relative
+    tolerance: float = Field(1e-3, gt=0, lt=1)  # adaptive: of the highest third of the shape's modes, relative
     device: str = Field("cpu", pattern=r"^(cpu|torch|cuda(:\d+)?)$")
 
 

@@ -1,11 +1,11 @@
 #!/bin/bash
 # A stage of a data set as a job array: P jobs of one core each, each makes every P-th shard. They need no MPI and wait for nobody.
 #
-#   harvest=$(sbatch --parsable --array=1-32 scripts/slurm/datagen_array.sh harvest configs/datagen/full.toml data/full)
-#   sbatch --dependency=afterok:$harvest --wrap ".venv/bin/python -m datagen harvest configs/datagen/full.toml -o data/full &&
-#                                                .venv/bin/python -m datagen select  configs/datagen/full.toml -o data/full"
-#   label=$(sbatch --parsable --array=1-32 scripts/slurm/datagen_array.sh label configs/datagen/full.toml data/full)
-#   sbatch --dependency=afterok:$label   --wrap ".venv/bin/python -m datagen label   configs/datagen/full.toml -o data/full"
+#   harvest=$(sbatch --parsable --array=1-32 scripts/slurm/datagen_array.sh harvest configs/datagen/default.toml data/default)
+#   sbatch --dependency=afterok:$harvest --wrap ".venv/bin/python -m datagen harvest configs/datagen/default.toml -o data/default &&
+#                                                .venv/bin/python -m datagen select  configs/datagen/default.toml -o data/default"
+#   label=$(sbatch --parsable --array=1-32 scripts/slurm/datagen_array.sh label configs/datagen/default.toml data/default)
+#   sbatch --dependency=afterok:$label   --wrap ".venv/bin/python -m datagen label   configs/datagen/default.toml -o data/default"
 #
 # The stage without --part makes what is missing, if anything is, and joins the parts. Jobs that were stopped, failed or killed: submit the
 # same again, only missing shards are made; --array=3,7 with PARTS=32 in the environment for those parts alone, or another number of parts.

@@ -1,8 +1,8 @@
 #!/bin/bash
 # A data set by one job on several nodes: tasks are dealt out one by one to all ranks. The data folder must be on a disk that all nodes see.
 #
-#   sbatch scripts/slurm/datagen_mpi.sh make configs/datagen/full.toml -o data/full
-#   sbatch --nodes=8 --time=24:00:00 scripts/slurm/datagen_mpi.sh label configs/datagen/full.toml -o data/full --modes 0-4
+#   sbatch scripts/slurm/datagen_mpi.sh make configs/datagen/default.toml -o data/default
+#   sbatch --nodes=8 --time=24:00:00 scripts/slurm/datagen_mpi.sh label configs/datagen/default.toml -o data/default --modes 0-4
 #
 # A job that was stopped, failed or killed: submit the same again, only missing shards are made.
 #
