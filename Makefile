@@ -1,11 +1,12 @@
-# make demo: set up everything, run two vesicles in shear and 100 in a parabolic flow, leave pictures in out/demo.
+# make demo: set up everything, run two vesicles in shear and 100 in a parabolic flow, make a small data set; leave it all in out/demo.
+# make dataset: harvest and select the shapes of configs/datagen/default.toml into data/default, or go on with that.
 # make test: set up everything, run the tests, on as many processes as there are cores.
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 export OMP_WAIT_POLICY = PASSIVE
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo dataset test lint clean
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt
@@ -20,6 +21,11 @@ demo: $(READY)
 	$(BIN)/python -m biem plot out/demo/shear_pair.h5 -o out/demo/shear_pair
 	$(BIN)/python -m biem run configs/scenes/poiseuille_100.toml -o out/demo/poiseuille_100.h5 --force
 	$(BIN)/python -m biem plot out/demo/poiseuille_100.h5 -o out/demo/poiseuille_100
+	$(BIN)/python -m datagen make configs/datagen/smoke.toml -o out/demo/data
+
+dataset: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/mpirun -n $$(nproc) $(BIN)/python -m datagen harvest configs/datagen/default.toml -o data/default
+	$(BIN)/python -m datagen select configs/datagen/default.toml -o data/default
 
 test: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
