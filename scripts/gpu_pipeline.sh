@@ -1,7 +1,9 @@
 #!/usr/bin/env bash
-# What only a CUDA machine can show. bash scripts/gpu_pipeline.sh bench [--smoke]
+# What only a CUDA machine can show. bash scripts/gpu_pipeline.sh bench | data [--smoke]
 # bench: seconds of a step by stage, device and precision, and pairs a second of the direct sum; under ten minutes.
-#   Writes $OUT/bench_step_cuda.json and .md (OUT: default out/gpu). --smoke: small cases on the CPU.
+#   Writes $OUT/bench_step_cuda.json and .md (OUT: default out/gpu).
+# data: harvest the runs of configs/datagen/default.toml on the device, select, and label on the CPU's cores. Writes $OUT/data.
+# --smoke: small cases on the CPU. MPIRUN: a launcher such as "mpirun -n 16", for the labels.
 # PYTHON: the interpreter, with this package's dependencies installed, cufinufft and a CUDA build of PyTorch among them.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -24,10 +26,22 @@ bench() {
     } | tee "$OUT/bench_step_cuda.md"
 }
 
+data() {
+    local config=configs/datagen/default.toml device=cuda
+    if [[ "${1:-}" == "--smoke" ]]; then
+        config=configs/datagen/smoke.toml device=torch
+    fi
+    time "$PYTHON" -m datagen harvest "$config" -o "$OUT/data" --device "$device"
+    time "$PYTHON" -m datagen select "$config" -o "$OUT/data"
+    # shellcheck disable=SC2086  # a launcher and its arguments
+    time OMP_NUM_THREADS=1 ${MPIRUN:-} "$PYTHON" -m datagen label "$config" -o "$OUT/data"
+}
+
 case "${1:-}" in
     bench) bench "${2:-}" ;;
+    data) data "${2:-}" ;;
     *)
-        sed -n 2,5p "$0" >&2
+        sed -n 2,8p "$0" >&2
         exit 2
         ;;
 esac
