@@ -30,6 +30,7 @@ Force = Annotated[bool, typer.Option("--force", help="Start anew, remove what is
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")]
 Device = Annotated[str | None, typer.Option("--device", help="Override simulation.device.")]
 Maps = Annotated[str | None, typer.Option("--maps", help="Override label.maps: --maps relax,advection.", metavar="A,B")]
+Name = Annotated[str, typer.Option("--name", help="Of this set of labels, beside others of the same shapes: labels-NAME, pairs-NAME.h5.")]
 Modes = Annotated[str | None, typer.Option("--modes", help="Override label.modes: --modes 0,1,2 or 0-4.", metavar="K,L-M")]
 
 
@@ -57,6 +58,7 @@ def select(config: ConfigPath, output: Output = None, force: Force = False, quie
 def label(
     config: ConfigPath,
     output: Output = None,
+    name: Name = "",
     part: PartOf = None,
     maps: Maps = None,
     modes: Modes = None,
@@ -65,7 +67,7 @@ def label(
     overrides: Overrides = None,
 ) -> None:
     """Make the training pairs of the shapes: DATA/labels/, joined in DATA/pairs.h5."""
-    _stages([label_stage], config, output, overrides, part=part, maps=maps, modes=modes, force=force, quiet=quiet)
+    _stages([label_stage], config, output, overrides, name=name, part=part, maps=maps, modes=modes, force=force, quiet=quiet)
 
 
 @app.command()
@@ -112,6 +114,7 @@ def _stages(
     output: Path | None,
     overrides: list[str] | None,
     *,
+    name: str = "",
     part: str | None = None,
     device: str | None = None,
     maps: str | None = None,
@@ -132,7 +135,7 @@ def _stages(
             changes.append(f"label.modes={json.dumps(parse_modes(modes))}")
         config = load_dataset(path, changes)
         data = output or Path("data") / config.name
-        return Session(config, data, WHOLE if part is None else Part.parse(part), force, quiet or ranks.rank > 0, ranks)
+        return Session(config, data, WHOLE if part is None else Part.parse(part), force, quiet or ranks.rank > 0, ranks, name)
 
     def run() -> None:
         session = begin()

@@ -102,7 +102,10 @@ class Dataset(Table):
     label: Label = Label()
 
 
-EXPECTED = {"simulation.points": 'an even number of at least 16, or "adaptive"'}
+EXPECTED = {
+    "simulation.points": 'an even number of at least 16, or "adaptive"',
+    "simulation.device": '"cpu" (NumPy), "torch" (PyTorch on the CPU), "cuda" or "cuda:N"',
+}
 
 
 def load_dataset(path: str | Path, overrides: Iterable[str] = ()) -> Dataset:

@@ -5,6 +5,7 @@ A stage is a function of a Session, called on all ranks. It returns when its fil
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from tqdm import tqdm
 from biem.backend import counting
 from biem.errors import NumericalFailure
 from biem.ranks import ALONE, Ranks
+from biem.run.solver import check_device
 from datagen.config import MAPS, Dataset, Label
 from datagen.jobs import Report, run_tasks
 from datagen.ledger import Ledger
@@ -27,13 +29,50 @@ from datagen.manifest import WHOLE, Column, Manifest, Part, Shard, check_same, r
 from datagen.shards import Arrays, damage, join_shards, read_shard, shard_name, write_shard
 from datagen.stop import Stopped, unless_stopped
 
-HARVEST, LABELS = "harvest", "labels"  # in the data folder, as the following
-SHAPES, SHAPES_MANIFEST, PAIRS, PAIRS_MANIFEST = "shapes.h5", "shapes.json", "pairs.h5", "pairs.json"
+HARVEST, SHAPES, SHAPES_MANIFEST = "harvest", "shapes.h5", "shapes.json"  # in the data folder
+LABEL_SET = re.compile(r"labels(?:-([A-Za-z0-9_.-]+))?|pairs(?:-([A-Za-z0-9_.-]+))?\.h5")
+
+
+@dataclass(frozen=True)
+class LabelSet:
+    """Where the labels of some settings lie; of the same shapes there may be several, with names. data: the data folder."""
+
+    data: Path
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not LABEL_SET.fullmatch(self.folder.name):
+            raise ValueError(f"--name {self.name}: expected letters, digits, and the signs . _ -")
+
+    @property
+    def _suffix(self) -> str:
+        return f"-{self.name}" if self.name else ""
+
+    @property
+    def folder(self) -> Path:
+        """Of the shards."""
+        return self.data / f"labels{self._suffix}"
+
+    @property
+    def pairs(self) -> Path:
+        """The file that joins them."""
+        return self.data / f"pairs{self._suffix}.h5"
+
+    @property
+    def manifest(self) -> Path:
+        """Of that file."""
+        return self.pairs.with_suffix(".json")
+
+
+def label_sets(data: Path) -> list[LabelSet]:
+    """All sets of labels in a data folder, whole or not."""
+    found = (LABEL_SET.fullmatch(path.name) for path in data.glob("*"))
+    return [LabelSet(data, name) for name in sorted({match[1] or match[2] or "" for match in found if match})]
 
 
 @dataclass(frozen=True)
 class Session:
-    """What a stage is asked to do. data: the data folder."""
+    """What a stage is asked to do. data: the data folder; labels: the name of the set of labels."""
 
     config: Dataset
     data: Path
@@ -41,6 +80,7 @@ class Session:
     force: bool = False
     quiet: bool = False
     ranks: Ranks = ALONE
+    labels: str = ""
 
     def say(self, line: str, aloud: bool = False) -> None:
         """A line of the first rank. aloud: to stderr, also when quiet."""
@@ -92,6 +132,7 @@ def harvest_stage(session: Session) -> None:
     from datagen.harvest import harvest, harvest_tasks
 
     config, folder = session.config, session.data / HARVEST
+    check_device(config.simulation.device, "simulation.device")
     tasks = harvest_tasks(config)
     _fill(session, folder, _harvest_wanted(config), tasks, partial(harvest, config), "shapes")
 
@@ -103,14 +144,14 @@ def select_stage(session: Session) -> None:
 
 def label_stage(session: Session) -> None:
     """data/shapes.h5 -> data/labels/, and data/pairs.h5 when they are complete."""
-    data, label = session.data, resolved(session.config.label)
+    data, label, files = session.data, resolved(session.config.label), LabelSet(session.data, session.labels)
     shapes = session.ranks.on_root(lambda: finished_shapes(session.config, data))
     n = shapes.rows
     tasks = [Rows(k, start, min(start + label.chunk, n)) for k, start in enumerate(range(0, n, label.chunk))]
     wanted = Manifest(stage="label", settings=settings(session.config, "label"), input=shapes.digest, tasks=len(tasks))
-    everything = _fill(session, data / LABELS, wanted, tasks, partial(label_rows, data / SHAPES, label), "pairs")
+    everything = _fill(session, files.folder, wanted, tasks, partial(label_rows, data / SHAPES, label), "pairs")
     if session.part == WHOLE:
-        session.ranks.on_root(lambda: _join(session, everything), share=False)
+        session.ranks.on_root(lambda: _join(session, files, everything), share=False)
 
 
 def label_rows(path: Path, label: Label, rows: Rows) -> Arrays:
@@ -236,10 +277,9 @@ def _raise(report: Report, everything: Manifest, tasks: int) -> None:
         raise NumericalFailure(f"{len(report.failures)} of {tasks} tasks failed twice and were set aside; run again to try them once more")
 
 
-def _join(session: Session, labels: Manifest) -> None:
-    path, manifest = session.data / PAIRS, session.data / PAIRS_MANIFEST
-    for old in (manifest, *session.data.glob(".pairs.*.tmp")):
+def _join(session: Session, files: LabelSet, labels: Manifest) -> None:
+    for old in (files.manifest, *session.data.glob(f".{files.pairs.stem}.*.tmp")):
         old.unlink(missing_ok=True)
-    shard = join_shards(path, session.data / LABELS, labels)
-    write_manifest(manifest, labels.model_copy(update={"stage": "join", "input": labels.digest, "tasks": 1, "shards": [shard]}))
-    session.say(f"label: {labels.rows} pairs joined in {path}")
+    shard = join_shards(files.pairs, files.folder, labels)
+    write_manifest(files.manifest, labels.model_copy(update={"stage": "join", "input": labels.digest, "tasks": 1, "shards": [shard]}))
+    session.say(f"label: {labels.rows} pairs joined in {files.pairs}")

@@ -20,7 +20,7 @@ from biem.scene.tables import validated
 from datagen.config import SPLITS, Label
 from datagen.manifest import Column, Manifest, Shard, manifest_paths, read_manifest, read_manifests
 from datagen.shards import Arrays, damage, dataset_names, shard_name, sources
-from datagen.stages import HARVEST, LABELS, PAIRS, PAIRS_MANIFEST, SHAPES, SHAPES_MANIFEST
+from datagen.stages import HARVEST, SHAPES, SHAPES_MANIFEST, LabelSet, label_sets
 
 TOLERANCE = 1e-6  # of a row's largest value: labels computed again on another machine; on the same one they are equal
 BATCH = 64  # shapes whose labels are computed again at once
@@ -45,24 +45,26 @@ class _Folder:
 def verify(data: Path, seed: int = 0, fraction: float = 0.01, progress: bool = False) -> Checked:
     """All checks of a data folder. seed, fraction: which labels are computed again, at least one. Raises ValueError if there is no data."""
     checked = Checked()
-    if not any((data / name).exists() for name in (HARVEST, SHAPES, SHAPES_MANIFEST, LABELS, PAIRS)):
+    sets = label_sets(data)
+    if not sets and not any((data / name).exists() for name in (HARVEST, SHAPES, SHAPES_MANIFEST)):
         raise ValueError(f"{data} holds no data set: give the folder that `python -m datagen` has written to")
     harvest = _shards(data / HARVEST, (), "shapes", checked, progress)
     shapes = _shapes(data, checked)
-    labels = _shards(data / LABELS, ("run", "split", "shape"), "pairs", checked, progress)
     if harvest and shapes:
         _check_follows(data / SHAPES_MANIFEST, shapes.manifest, data / HARVEST, harvest.manifest, checked)
-    if labels and not shapes and not (data / SHAPES).exists():
-        checked.problems.append(f"{data / SHAPES} is missing, the labels in {data / LABELS} are of its shapes")
-    if labels and shapes:
-        _check_follows(data / LABELS, labels.manifest, data / SHAPES, shapes.manifest, checked)
-    if labels and shapes and shapes.kept:
-        _check_pairs(data, shapes.kept[SHAPES], labels, checked)
-        _recompute(data, shapes.kept[SHAPES], labels, np.random.default_rng(seed), fraction, checked, progress)
-    if labels and labels.manifest.complete:
-        _check_joined(data, labels, checked)
-    elif (data / PAIRS).exists() and not (data / LABELS).exists():
-        checked.problems.append(f"{data / PAIRS} joins shards that are not there: run `python -m datagen label`")
+    for files in sets:
+        labels = _shards(files.folder, ("run", "split", "shape"), "pairs", checked, progress)
+        if labels and not shapes and not (data / SHAPES).exists():
+            checked.problems.append(f"{data / SHAPES} is missing, the labels in {files.folder} are of its shapes")
+        if labels and shapes:
+            _check_follows(files.folder, labels.manifest, data / SHAPES, shapes.manifest, checked)
+        if labels and shapes and shapes.kept:
+            _check_pairs(files.folder, shapes.kept[SHAPES], labels, checked)
+            _recompute(files.folder, shapes.kept[SHAPES], labels, np.random.default_rng(seed), fraction, checked, progress)
+        if labels and labels.manifest.complete:
+            _check_joined(files, labels, checked)
+        elif files.pairs.exists() and not files.folder.exists():
+            checked.problems.append(f"{files.pairs} joins shards that are not there: run `python -m datagen label`")
     return checked
 
 
@@ -180,7 +182,7 @@ def _check_follows(path: Path, later: Manifest, before: Path, earlier: Manifest,
         checked.problems.append(f"{path} was not made from {before} as it is now")
 
 
-def _check_pairs(data: Path, shapes: Arrays, labels: _Folder, checked: Checked) -> None:
+def _check_pairs(folder: Path, shapes: Arrays, labels: _Folder, checked: Checked) -> None:
     """Whether each pair is of the shape, run and split that it says."""
     start = 0
     chunk = labels.manifest.settings["label"]["chunk"]
@@ -189,7 +191,7 @@ def _check_pairs(data: Path, shapes: Arrays, labels: _Folder, checked: Checked) 
         start = task * chunk
         if arrays is None:
             continue
-        path = data / LABELS / shard_name(task)
+        path = folder / shard_name(task)
         rows = np.arange(start, min(start + chunk, len(shapes["run"])))
         if not np.array_equal(arrays["shape"], rows):
             checked.problems.append(f"{path}: its rows are not the shapes {start} to {start + len(rows) - 1}")
@@ -199,14 +201,14 @@ def _check_pairs(data: Path, shapes: Arrays, labels: _Folder, checked: Checked) 
                 checked.problems.append(f"{path}: {name} differs from that of the shapes")
 
 
-def _check_joined(data: Path, labels: _Folder, checked: Checked) -> None:
-    path, manifest = data / PAIRS, labels.manifest
+def _check_joined(files: LabelSet, labels: _Folder, checked: Checked) -> None:
+    path, manifest = files.pairs, labels.manifest
     problems: list[str] = []
     try:
-        if not (data / PAIRS_MANIFEST).exists():
+        if not files.manifest.exists():
             raise ValueError("it has not been made from all parts of the labels")
-        joined = read_manifest(data / PAIRS_MANIFEST)
-        if [shard.file for shard in joined.shards] != [PAIRS] or joined.input != manifest.digest:
+        joined = read_manifest(files.manifest)
+        if [shard.file for shard in joined.shards] != [path.name] or joined.input != manifest.digest:
             raise ValueError("it was not made from the labels as they are now")
         if _content(path, joined.shards[0], checked) is None:
             return
@@ -215,7 +217,7 @@ def _check_joined(data: Path, labels: _Folder, checked: Checked) -> None:
             for name in sorted(set(names) ^ set(manifest.columns)):
                 problems.append(f"{path}: {name} is in it, or in the shards, alone")
             for name in sorted(set(names) & set(manifest.columns)):
-                if not _joins(file[name], manifest.columns[name], manifest):
+                if not _joins(file[name], manifest.columns[name], manifest, files.folder.name):
                     problems.append(f"{path}: {name} does not join all shards in their order")
             sound = not problems and len(labels.kept) == manifest.tasks  # what is damaged is not read, HDF5 may crash on it
             if sound and not np.array_equal(file["shape"][()], np.arange(manifest.rows)):
@@ -227,17 +229,17 @@ def _check_joined(data: Path, labels: _Folder, checked: Checked) -> None:
         checked.found.append(f"{path}: {manifest.rows} pairs, {len(manifest.columns)} datasets")
 
 
-def _joins(dataset: h5py.Dataset, column: Column, manifest: Manifest) -> bool:
+def _joins(dataset: h5py.Dataset, column: Column, manifest: Manifest, folder: str) -> bool:
     if not dataset.is_virtual or dataset.shape != (manifest.rows, *column.shape) or dataset.dtype.str != column.dtype:
         return False
     ends = np.cumsum([shard.rows for shard in manifest.shards]).tolist()
     name = dataset.name.lstrip("/")
-    expected = [(f"{LABELS}/{s.file}", name, end - s.rows, end) for s, end in zip(manifest.shards, ends, strict=True) if s.rows]
+    expected = [(f"{folder}/{s.file}", name, end - s.rows, end) for s, end in zip(manifest.shards, ends, strict=True) if s.rows]
     return sources(dataset) == expected and (dataset.dtype.kind not in "fc" or bool(np.isnan(dataset.fillvalue)))
 
 
 def _recompute(
-    data: Path, shapes: Arrays, labels: _Folder, random: np.random.Generator, fraction: float, checked: Checked, progress: bool
+    folder: Path, shapes: Arrays, labels: _Folder, random: np.random.Generator, fraction: float, checked: Checked, progress: bool
 ) -> None:
     """Computes the labels of some shapes again, of those whose shards are sound."""
     from datagen.label import label_shapes
@@ -254,12 +256,12 @@ def _recompute(
         again = label_shapes(decode(shapes["coefficients"][some], label.operator_points), label)
         for task in np.unique(some // label.chunk):
             here = some // label.chunk == task
-            path = data / LABELS / shard_name(int(task))
+            path = folder / shard_name(int(task))
             with h5py.File(path, "r") as file:
                 for name, values in again.items():
                     _compare(path, name, some[here], values[here], file[name][some[here] - task * label.chunk], checked)
     if len(checked.problems) == before:
-        checked.found.append(f"{data / LABELS}: the labels of {len(rows)} shapes, computed again, are the same")
+        checked.found.append(f"{folder}: the labels of {len(rows)} shape(s), computed again, are the same")
 
 
 def _compare(path: Path, name: str, rows: np.ndarray, again: np.ndarray, stored: np.ndarray, checked: Checked) -> None:

@@ -163,7 +163,7 @@ def label_shapes(X, label):
     return {name: values.astype(np.float32) for name, values in pairs.items()}
 
 
-def report(shapes, folder, seed):
+def report(shapes, folder, seed, flows):
     statistics = {"n": len(shapes["run"])}
     (folder / "coverage.json").write_text(json.dumps(statistics))
     return statistics

@@ -22,21 +22,28 @@ from biem.steppers.stepper import Flow, State, Stepper
 from biem.stokes.interaction import Fields
 
 
+def check_device(name: str, key: str = "solver.device") -> int:
+    """The number of CUDA devices, where `name` is one. Raises ValueError for a device or a library that this machine does not have."""
+    if name != "cpu" and find_spec("torch") is None:
+        raise ValueError(f'{key} = "{name}" needs PyTorch: pip install torch, or take "cpu"')
+    if not name.startswith("cuda"):
+        return 0
+    import torch
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if int(name.partition(":")[2] or 0) >= count:
+        raise ValueError(f'{key} = "{name}": this machine has {count} CUDA device(s) that PyTorch can use; take "cpu"')
+    return count
+
+
 def check_machine(problem: Problem, ranks: Ranks = ALONE) -> None:
     """Raises ValueError, before the first step, for a device, a library or memory that this machine does not have."""
-    name = problem.scene.solver.device
-    if name != "cpu" and find_spec("torch") is None:
-        raise ValueError(f'solver.device = "{name}" needs PyTorch: pip install torch, or take "cpu"')
-    if name.startswith("cuda"):
+    devices = check_device(problem.scene.solver.device)
+    free = _free_memory()
+    if devices:
         import torch
 
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        number = int(name.partition(":")[2] or 0)
-        if number >= count:
-            raise ValueError(f'solver.device = "{name}": this machine has {count} CUDA device(s) that PyTorch can use; take "cpu"')
-        free = float(torch.cuda.mem_get_info(ranks.rank % count)[0])
-    else:
-        free = _free_memory()
+        free = float(torch.cuda.mem_get_info(ranks.rank % devices)[0])
     needed = memory_estimate(problem)
     if needed > free:
         M, _, N = problem.X.shape

@@ -77,10 +77,26 @@ def test_what_is_gone_or_of_another_size_is_told_and_made_again(config, whole):
     assert {name for name, stamp in stamps(whole / "harvest").items() if stamp != made[name]} == {"000002.h5"}
 
 
+def test_labels_of_other_settings_stand_beside_the_first_ones(config, whole):
+    before = contents(whole)
+    assert "label.dt was" in the_error(cli("label", config, "-o", whole, "--set", "label.dt=1e-4"), 2)
+    run("label", config, "-o", whole, "--name", "slow", "--set", "label.dt=1e-4", "--maps", "relax")
+    assert {name: content for name, content in contents(whole).items() if "slow" not in name} == before
+    with open_joined(whole / "pairs-slow.h5") as pairs:
+        assert dataset_names(pairs) == ["X_std", "relax", "run", "shape", "split"]
+        assert pairs["shape"].shape == (N,)
+    assert "FAILED" not in run("verify", whole).output
+    (whole / "labels-slow" / "000001.h5").write_bytes(b"cut")
+    result = cli("verify", whole, "--quiet")
+    assert result.exit_code == 3
+    assert f"{whole / 'labels-slow' / '000001.h5'} has 3 bytes" in result.stdout
+    assert "letters, digits" in the_error(cli("label", config, "-o", whole, "--name", "a/b"), 2)
+
+
 def test_name_and_device_do_not_count_all_else_does(tmp_path, config, whole):
     run("make", config, "-o", whole, "--set", "name=other", "--device", "torch")
     run("label", config, "-o", whole, "--modes", "0-4", "--maps", "near,relax,self_tension,flow_tension,advection")
-    for change in ("seed=4", "shapes.modes=9", "simulation.tolerance=1e-4", "select.distance=0.1", "label.dt=1e-4", "label.chunk=11"):
+    for change in ("seed=4", "shapes.points=64", "simulation.tolerance=1e-4", "select.distance=0.1", "label.dt=1e-4", "label.chunk=11"):
         message = the_error(cli("make", config, "-o", whole, "--set", change), 2)
         key, _, value = change.partition("=")
         assert re.search(rf"{re.escape(key)} was \S+, is {float(value):g}".replace("0.0001", r"(1e-04|0\.0001)"), message), message
@@ -232,3 +248,10 @@ def test_help_is_there(command):
     result = cli(*command, "--help")
     assert result.exit_code == 0
     assert "Usage" in result.output
+
+
+def test_more_modes_than_nodes_hold_are_refused_at_once(tmp_path, config):
+    for key, points in (("shapes.points", 32), ("label.operator_points", 16)):
+        message = the_error(cli("harvest", config, "-o", tmp_path, "--set", f"{key}={points}", "--set", "shapes.modes=40"), 2)
+        assert "40 modes: take twice as many nodes" in message
+    assert "CUDA device" in the_error(cli("harvest", config, "-o", tmp_path / "no", "--device", "cuda:77"), 2)
