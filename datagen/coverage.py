@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
@@ -123,7 +124,8 @@ def _picture(stats: Mapping[str, Any], shapes: Mapping[str, np.ndarray]) -> byte
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic([list(LABELS), ["shapes"] * len(LABELS)], height_ratios=[1.0, 2.0])
     families = np.unique(shapes["family"])
-    colors = [f"C{k % 10}" for k in range(len(families))]
+    palette = colormaps["tab10" if len(families) <= 10 else "tab20"].colors  # type: ignore[attr-defined]
+    colors = [palette[k % len(palette)] for k in range(len(families))]
     for name, label in LABELS.items():
         _draw_histogram(axes[name], stats[name], label, list(stats["families"]), colors)
     axes["bending_energy"].legend(frameon=False, fontsize=8, title="family")
@@ -133,7 +135,7 @@ def _picture(stats: Mapping[str, Any], shapes: Mapping[str, np.ndarray]) -> byte
     return content.getvalue()
 
 
-def _draw_histogram(axes: Any, of: Mapping[str, Any], label: str, names: list[str], colors: list[str]) -> None:
+def _draw_histogram(axes: Any, of: Mapping[str, Any], label: str, names: list[str], colors: list[Any]) -> None:
     edges = np.array(of["edges"])
     below = np.zeros(len(edges) - 1)
     for counts, name, color in zip(of["counts"], names, colors, strict=True):
