@@ -34,7 +34,7 @@ def required_parts(problem: Problem) -> list[Part]:
     moved = ", ".join(["the flow"] * flowing + ["the other vesicles"] * many + ["the walls' answer"] * walled)
     parts = [
         Part("relaxation", True, "bending is implicit: one dense solve a vesicle"),
-        Part("background flow", flowing, f"flow {problem.flow.kind}" if flowing else "the fluid is at rest"),
+        Part("background flow", flowing, _flow(problem)),
     ]
     if split:
         needed = many or flowing or walled
@@ -49,8 +49,8 @@ def required_parts(problem: Problem) -> list[Part]:
     how = "explicit, two sums a step" if split else "GMRES over pair sums"
     parts += [
         Part("vesicle-vesicle coupling", many, f"{M} vesicles: {how}" if many else "one vesicle"),
-        _far_field(problem) if many else Part("far field", False, "one vesicle"),
-        _near_field(problem) if many else Part("near field", False, "one vesicle"),
+        _far_field(problem) if many or walled else Part("far field", False, "one vesicle"),
+        _near_field(problem) if many or walled else Part("near field", False, "one vesicle"),
         Part(
             "repulsion",
             (many or walled) and solver.repulsion is not None,
@@ -63,6 +63,11 @@ def required_parts(problem: Problem) -> list[Part]:
         _walls(problem),
     ]
     return parts
+
+
+def _flow(problem: Problem) -> str:
+    kind = problem.flow.kind
+    return {"quiescent": "the fluid is at rest", "walls": "driven by the walls"}.get(kind, f"flow {kind}")
 
 
 def _asked(wanted: bool) -> str:
@@ -84,20 +89,23 @@ def _near_field(problem: Problem) -> Part:
     scheme = "upsample" if layered else near_scheme(solver.near_field)
     if scheme == "none":
         return Part("near field", False, 'solver.near_field = "none"')
-    where = f"{scheme}, on demand: where a membrane is within {near_width(scheme, solver.tolerances[0]):.1f} h of another"
+    others = "another" if problem.walls is None else "another or of a wall"
+    where = f"{scheme}, on demand: where a membrane is within {near_width(scheme, solver.tolerances[0]):.1f} h of {others}"
     return Part("near field", True, where + (f"; {solver.near_field} within 1 h" if layered else ""))
 
 
 def _far_field(problem: Problem) -> Part:
     scheme = _scheme(problem)
     tolerance = f", tolerance {problem.scene.solver.tolerances[1]:g}" if scheme == "ewald" else ""
-    return Part("far field", True, f"{scheme} sum of {problem.X.shape[0] * problem.X.shape[2]} points{tolerance}")
+    of_walls = "" if problem.walls is None else f", at these and at {len(problem.walls.nodes)} on walls"
+    return Part("far field", True, f"{scheme} sum of {problem.X.shape[0] * problem.X.shape[2]} points{of_walls}{tolerance}")
 
 
 def _scheme(problem: Problem) -> str:
     M, _, N = problem.X.shape
     solver = problem.scene.solver
-    return far_scheme(solver.far_field, M * N, M * N, solver.tolerances[1], solver.device.startswith("cuda"))
+    targets = M * N + (0 if problem.walls is None else len(problem.walls.nodes))
+    return far_scheme(solver.far_field, targets, M * N, solver.tolerances[1], solver.device.startswith("cuda"))
 
 
 def memory_estimate(problem: Problem) -> float:

@@ -152,6 +152,10 @@ SPLIT_PLANS = {  # changes of the scene and what is needed beyond relaxation and
         {**CLOSE, "solver": {"near_field": "none"}},
         {"background flow", "advection", "tension", "vesicle-vesicle coupling", "far field"},
     ),
+    "between walls": (
+        {"flow": {"kind": None, "rate": None}, "walls": {"kind": "circle", "radius": 0.5, "omega": 100.0}},
+        {"background flow", "advection", "tension", "far field", "near field", "walls"},
+    ),
     "adaptive, order 2": (
         {"time": {"adaptive": True, "order": 2}},
         {"background flow", "advection", "extrapolation", "step size control"},
