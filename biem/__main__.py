@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from tqdm import tqdm
 
-from biem.backend import fft_backend
+from biem.backend import fft_backend, threads
 from biem.cli import fail, first_rank_only, one_line_errors
 from biem.curves.curve import area, length
 from biem.ranks import Ranks, world
@@ -22,6 +22,9 @@ from biem.scene.build import Problem, build
 from biem.scene.config import Scene, load_scene
 from biem.scene.plan import memory_estimate, required_parts, trajectory_bytes
 from biem.steppers.stepper import State
+
+WALL_SECONDS = 2.5e-10  # to factorise walls, per cube of their nodes, on one core (docs/measurements.md)
+LONGEST_MEASUREMENT = 20.0  # s
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
 
@@ -75,7 +78,10 @@ def plan(
         for part in parts:
             typer.echo(f"  {'yes' if part.needed else ' - '}  {part.name:<{wide}}  {part.why}")
         typer.echo(f"memory of a step: {memory_estimate(problem) / 1e6:.0f} MB; trajectory: {trajectory_bytes(problem) / 1e6:.1f} MB")
-        if measure:
+        factorization = 0.0 if problem.walls is None else WALL_SECONDS * len(problem.walls.nodes) ** 3 / threads()
+        if factorization > LONGEST_MEASUREMENT:
+            typer.echo(f"time: the walls take about {_clock(factorization)} to factorise, once; steps are not measured")
+        elif measure:
             seconds = _seconds_a_step(problem)
             total = "if all are as long as the first one" if adaptive else "in all"
             typer.echo(f"time: {seconds:.3g} s a step here, about {_clock(seconds * problem.steps)} {total}")

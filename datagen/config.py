@@ -1,7 +1,7 @@
 """The file of a data set (TOML): which flows are harvested, which shapes are kept, which labels are made. Lengths are in membrane lengths.
 
-Everything is in the natural units mu = kappa_b = length = 1. Each stage has its table; a stage is made anew where its own table, or that
-of a stage before it, has changed.
+Everything is in the natural units mu = kappa_b = length = 1. Each stage has its table; what a stage made with other values of its own
+table, or of that of a stage before it, is refused.
 """
 
 from __future__ import annotations
@@ -114,6 +114,11 @@ def load_dataset(path: str | Path, overrides: Iterable[str] = ()) -> Dataset:
     table = read_toml(path, "data set", "configs/datagen/smoke.toml", overrides)
     table.setdefault("name", path.stem)
     config = validated(Dataset, table, EXPECTED)
+    for number, family in enumerate(config.harvest):
+        for key in ("capillary", "confinement", "offset"):
+            low, high = getattr(family, key)
+            if not low <= high or low < 0 or (low == 0 and key != "offset"):
+                raise ValueError(f"harvest.{number}.{key} = [{low:g}, {high:g}]: expected positive numbers, the smaller one first")
     for key, points in (("shapes.points", config.shapes.points), ("label.operator_points", config.label.operator_points)):
         if points < 2 * config.shapes.modes:
             raise ValueError(f"{key} = {points} nodes do not hold shapes.modes = {config.shapes.modes} modes: take twice as many nodes")

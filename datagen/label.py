@@ -82,7 +82,9 @@ def label_modes(label: Label) -> tuple[int, ...]:
         raise ValueError(f"label.points is {N}: expected an even number, at most label.operator_points = {label.operator_points}")
     modes = tuple(range(N // 2 + 1)) if label.modes is None else tuple(label.modes)
     if not all(0 <= k <= N // 2 for k in modes) or len(set(modes)) < len(modes):
-        raise ValueError(f"label.modes is {list(modes)}: expected different numbers from 0 to {N // 2}, half of label.points")
+        wrong = next((k for k in modes if not 0 <= k <= N // 2), None)
+        what = "has a mode twice" if wrong is None else f"has {wrong}"
+        raise ValueError(f"label.modes {what}: expected different numbers from 0 to {N // 2}, half of label.points")
     return modes
 
 

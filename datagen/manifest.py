@@ -154,8 +154,10 @@ def check_same(path: Path, found: Manifest, wanted: Manifest) -> None:
     )
     differ = [key for key in (old | new) if old.get(key, ABSENT) != new.get(key, ABSENT)]
     what_to_do = f"choose another folder (-o), or start anew with `python -m datagen {wanted.stage} --force`"
+    if wanted.stage == "label":
+        what_to_do = f"give these labels a name of their own (--name), {what_to_do}"
     if differ:
-        what = "; ".join(f"{key} was {old.get(key, ABSENT)}, is {new.get(key, ABSENT)}" for key in differ[:4])
+        what = "; ".join(f"{key} was {_short(old.get(key, ABSENT))}, is {_short(new.get(key, ABSENT))}" for key in differ[:4])
         more = f" and {len(differ) - 4} more" if len(differ) > 4 else ""
         raise ValueError(f"{path} was made with other settings: {what}{more}; {what_to_do}")
     if found.input != wanted.input:
@@ -171,6 +173,11 @@ def check_columns(name: object, columns: Mapping[str, Column], known: Mapping[st
 
 
 ABSENT = "absent"
+LONGEST = 40  # of a value in an error
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 4]} ..."
 
 
 def _describe(column: Column | None) -> str:

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from biem.run.files import atomic_h5, one_line
-from datagen.manifest import Column, Manifest, Shard, read_manifests
+from datagen.manifest import Column, Manifest, Shard, read_manifest, read_manifests
 
 Arrays = dict[str, np.ndarray]
 
@@ -116,6 +116,9 @@ def open_joined(path: str | Path) -> Iterator[h5py.File]:
             wrong = damage(folder / shard.file, shard)
             if wrong:
                 raise ValueError(f"{folder / shard.file} {wrong}: make it again with `python -m datagen label`")
+        shapes = path.parent / "shapes.json"
+        if shapes.exists() and read_manifest(shapes).digest != manifest.input:
+            raise ValueError(f"{path} is of other shapes than {path.parent / 'shapes.h5'} holds now: `python -m datagen label --force`")
         if not manifest.complete or any(len(file[name]) != manifest.rows for name in names):
             raise ValueError(f"{path} does not join what is in {folder} now: make it again with `python -m datagen label`")
         yield file

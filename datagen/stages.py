@@ -211,8 +211,15 @@ def _select(session: Session) -> None:
     for old in (path, *data.glob(".shapes.*.tmp")):
         old.unlink(missing_ok=True)
     shard, columns = write_shard(data / SHAPES, shapes)
+    wanted = wanted.having([shard], columns)
+    for files in label_sets(data):
+        labels = read_manifests(files.folder)
+        if labels is not None and labels.input != wanted.digest:
+            session.say(
+                f"{files.folder} holds labels of other shapes now: make them anew with `python -m datagen label --force`", aloud=True
+            )
     statistics = report(shapes, data, config.seed, [family.flow for family in config.harvest])
-    write_manifest(path, wanted.having([shard], columns))  # last: what it acknowledges is all there
+    write_manifest(path, wanted)  # last: what it acknowledges is all there
     session.say(f"select: {shard.rows} of {harvested.rows} shapes in {data / SHAPES}")
     for line in summary(statistics):
         session.say(f"  {line}")
@@ -254,7 +261,7 @@ def _fill(session: Session, folder: Path, wanted: Manifest, tasks: Sequence[Task
     has = f"{len(everything.shards)} of {everything.tasks} shards, {everything.rows} {unit} in {folder}"
     session.say(f"{wanted.stage}: {has}" if part == WHOLE else f"{wanted.stage}, {part}: done; {has}")
     if part != WHOLE and everything.complete:
-        session.say(f"all parts are done: run `python -m datagen {wanted.stage}` without --part to join them")
+        session.say("all parts are done: run the same command without --part to join them")
     if runs_ended:
         session.say(f"  {runs_ended} runs ended early, their later shapes are missing")
     return everything

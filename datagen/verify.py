@@ -57,10 +57,11 @@ def verify(data: Path, seed: int = 0, fraction: float = 0.01, progress: bool = F
         if labels and not shapes and not (data / SHAPES).exists():
             checked.problems.append(f"{data / SHAPES} is missing, the labels in {files.folder} are of its shapes")
         if labels and shapes:
-            _check_follows(files.folder, labels.manifest, data / SHAPES, shapes.manifest, checked)
-        if labels and shapes and shapes.kept:
-            _check_pairs(files.folder, shapes.kept[SHAPES], labels, checked)
-            _recompute(files.folder, shapes.kept[SHAPES], labels, np.random.default_rng(seed), fraction, checked, progress)
+            follows = _check_follows(files.folder, labels.manifest, data / SHAPES, shapes.manifest, checked)
+            if shapes.kept:
+                _check_pairs(files.folder, shapes.kept[SHAPES], labels, checked)
+            if shapes.kept and follows:
+                _recompute(files.folder, shapes.kept[SHAPES], labels, np.random.default_rng(seed), fraction, checked, progress)
         if labels and labels.manifest.complete:
             _check_joined(files, labels, checked)
         elif files.pairs.exists() and not files.folder.exists():
@@ -173,13 +174,15 @@ def _check_columns(
     return {name: file[name][()] for name in keep} if sound else None
 
 
-def _check_follows(path: Path, later: Manifest, before: Path, earlier: Manifest, checked: Checked) -> None:
+def _check_follows(path: Path, later: Manifest, before: Path, earlier: Manifest, checked: Checked) -> bool:
     """Whether a stage was made from the one before it as it is now."""
     differ = [key for key, value in earlier.settings.items() if later.settings.get(key) != value]
     if differ:
         checked.problems.append(f"{path}: {', '.join(differ)} are not the settings of {before}")
     if later.input != earlier.digest and earlier.complete:
-        checked.problems.append(f"{path} was not made from {before} as it is now")
+        checked.problems.append(f"{path} was not made from {before} as it is now: make it anew with --force")
+        return False
+    return not differ
 
 
 def _check_pairs(folder: Path, shapes: Arrays, labels: _Folder, checked: Checked) -> None:

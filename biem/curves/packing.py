@@ -57,10 +57,12 @@ def random_packing(
     width = np.asarray(box, dtype=np.float64)
     radius = float(np.sqrt((shapes**2).sum(axis=1)).max())
     one = float(np.mean(area(shapes)))
-    if M * one > width.prod():
+    where, room_area = f"the box of {box[0]:g} x {box[1]:g}", float(width.prod())
+    if region is not None:
+        where, room_area = "the fluid between the walls", float(region.area)
+    if M * one > room_area:
         raise ValueError(
-            f"{M} vesicles do not fit: they cover {M * one:.3g}, the box of {box[0]:g} x {box[1]:g} has {width.prod():.3g}: "
-            f"fewer than {int(width.prod() / one)} can fit"
+            f"{M} vesicles do not fit: they cover {M * one:.3g}, {where} has {room_area:.3g}: fewer than {int(room_area / one)} can fit"
         )
     slots, pitch = _slots(M, width) if region is None else _slots_in(M, width, region, gap)
     centers = slots[rng.permutation(len(slots))[:M]]
@@ -83,9 +85,10 @@ def random_packing(
     now = np.asarray(shapely.polygons(corners(np.arange(M), centers, angles, size)))
     while moved.mean() < MOVES or size.min() < 1.0:
         if moved.mean() > MOST_MOVES:
+            other = 'or use placement = "grid"' if region is None else "or give the walls more room"
             raise ValueError(
-                f"no random packing of {M} vesicles in a box of {box[0]:g} x {box[1]:g} was found ({(size < 1).sum()} did not fit after "
-                f'{MOST_MOVES} moves each): lower count, area_fraction or gap, or use placement = "grid"'
+                f"no random packing of {M} vesicles in {where} was found ({(size < 1).sum()} did not fit after {MOST_MOVES} moves each): "
+                f"lower count, area_fraction or gap, {other}"
             )
         offset = rng.uniform(0.0, 2.0 * cell, size=2)
         index = np.floor((centers + offset) / cell).astype(int)

@@ -79,6 +79,7 @@ def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progre
         earlier = _frame(problem, start.step, start.state, {})
     else:
         start, earlier = found
+        _check_same_walls(problem, earlier)
     stepper = ranks.together(lambda: make_stepper(problem, start.area_0, start.length_0, ranks))
     start = replace(start, state=on_device(start.state, scene, ranks))
     attributes = {
@@ -148,6 +149,8 @@ class _Loop:
                     unit = self.problem.flow.time_scale
                     when = f"t = {self.state.t:.6g}" + (f" ({self.state.t / unit:.4g} t_gamma)" if unit else "")
                     way = "smaller steps (time.dt)" if self.controller is None else "a lower time.dt_min or a larger time.tolerance"
+                    if scene.walls is not None and scene.walls.kind == "channel" and "crosses a wall" in str(failure):
+                        way += "; at an end of the channel, where the fluid leaves, a longer channel or a shorter time.horizon"
                     raise NumericalFailure(
                         f"step {self.step + 1} rejected at {when}: {failure}; the state before it is kept; try {way}"
                     ) from None
@@ -273,6 +276,13 @@ class _Loop:
         if "gmres_iterations" in d:
             parts.append(f"GMRES {d['gmres_iterations']:.0f}")
         return ", ".join(parts)
+
+
+def _check_same_walls(problem: Problem, earlier: Trajectory) -> None:
+    """Walls from a file may have changed with it. Raises ValueError."""
+    old, new = earlier.attributes.get("walls", ()), () if problem.walls is None else problem.walls.curves
+    if len(old) != len(new) or not all(np.array_equal(a, b) for a, b in zip(old, new, strict=True)):
+        raise ValueError("the walls are not those of the frames before: restore walls.file, or start anew with --force")
 
 
 def _frame(problem: Problem, step: int, state: State, running: dict[str, float]) -> Trajectory:

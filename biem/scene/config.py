@@ -200,7 +200,7 @@ def time_value(value: float | str, key: str, units: dict[str, float | None]) -> 
         if len(words) == 2:
             unit = units[words[1]]
             if unit is None:
-                raise ValueError(f'time.{key} = "{value}": this flow has no {words[1]}; give a number, t_kappa, or a flow with a rate')
+                raise ValueError(f'time.{key} = "{value}": this flow has no {words[1]}; give a number, t_kappa, or flow or walls a rate')
             number *= unit
     else:
         number = float(value)

@@ -145,18 +145,24 @@ def _from_file(path: Path, spacing: float) -> list[np.ndarray]:
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"walls.file {path} cannot be read: {error}") from None
     except ValueError as error:
-        raise ValueError(f"walls.file {path}: {error}; expected two columns, x and y, and a blank line between curves") from None
+        what = " ".join(str(error).split()).rstrip(".;")
+        raise ValueError(
+            f"walls.file {path}: {what}; expected two columns, x and y, apart by spaces, a blank line between curves"
+        ) from None
     if not points:
         raise ValueError(f"walls.file {path} has no points")
     curves = []
     for number, block in enumerate(points):
         where = f"walls.file {path}, curve {number}"
-        if block.shape[1] != 2 or len(block) < 16 or len(block) % 2:
-            raise ValueError(
-                f"{where}: {len(block)} points of {block.shape[1]} columns; expected two columns and an even number of at least 16"
-            )
         if not np.isfinite(block).all():
-            raise ValueError(f"{where}: not all of its points are finite")
+            bad = int(np.flatnonzero(~np.isfinite(block).all(axis=1))[0])
+            raise ValueError(f"{where}: point {bad} is {block[bad].tolist()}, expected finite numbers")
+        if block.shape[1] != 2 or len(block) < 16 or len(block) % 2:
+            repeated = " (the first one is repeated at the end: leave that out)" if np.array_equal(block[0], block[-1]) else ""
+            raise ValueError(
+                f"{where}: {len(block)} points of {block.shape[1]} columns{repeated}; expected two columns and an even number, at "
+                "least 16, of points on a smooth curve"
+            )
         X = block.T if float(area(block.T[None])[0]) > 0 else block.T[:, ::-1]
         modes = np.abs(np.fft.rfft(X - X.mean(axis=1, keepdims=True)))
         if modes[:, -max(2, modes.shape[1] // 8) :].max() > RESOLVED * modes.max():

@@ -255,3 +255,21 @@ def test_more_modes_than_nodes_hold_are_refused_at_once(tmp_path, config):
         message = the_error(cli("harvest", config, "-o", tmp_path, "--set", f"{key}={points}", "--set", "shapes.modes=40"), 2)
         assert "40 modes: take twice as many nodes" in message
     assert "CUDA device" in the_error(cli("harvest", config, "-o", tmp_path / "no", "--device", "cuda:77"), 2)
+
+
+def test_labels_of_other_shapes_are_told_and_not_read(config, whole):
+    run("harvest", config, "-o", whole, "--force", "--set", "seed=9")
+    result = run("select", config, "-o", whole, "--force", "--set", "seed=9")
+    assert f"{whole / 'labels'} holds labels of other shapes now" in result.stderr
+    with pytest.raises(ValueError, match="is of other shapes than"), open_joined(whole / "pairs.h5"):
+        pass
+    assert "was not made from" in cli("verify", whole, "--quiet").stdout
+
+
+def test_ranges_have_the_smaller_number_first(tmp_path, config):
+    text = config.read_text()
+    assert "[[harvest]]" in text
+    for low, high in ((10, 1), (0, 1)):
+        config.write_text(text.replace("[[harvest]]", f"[[harvest]]\ncapillary = [{low}.0, {high}.0]", 1))
+        message = the_error(cli("harvest", config, "-o", tmp_path), 2)
+        assert f"harvest.0.capillary = [{low}, {high}]: expected positive numbers, the smaller one first" in message

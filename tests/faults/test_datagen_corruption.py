@@ -127,7 +127,7 @@ def test_values_that_are_not_finite_are_counted(whole):
     rewrite(whole / "harvest" / "000003.h5", whole / "harvest" / "manifest.json", spoil)
     lines = problems(whole)
     assert lines[0] == f"{whole / 'harvest' / '000003.h5'}: 2 values of time are not finite"
-    assert lines[1] == f"{whole / 'shapes.json'} was not made from {whole / 'harvest'} as it is now"
+    assert lines[1] == f"{whole / 'shapes.json'} was not made from {whole / 'harvest'} as it is now: make it anew with --force"
     assert len(lines) == 2
 
 

@@ -101,3 +101,37 @@ def test_other_walls_are_not_gone_on_with(scene):
 
 def test_attributes_stay_readable_as_json(scene):
     assert json.loads(finished(scene, "out.h5").attributes["scene"])["walls"]["obstacles"][0]["sides"] == 3
+
+
+def test_a_wall_file_that_has_changed_is_not_gone_on_with(scene):
+    t = 2 * np.pi * np.arange(64) / 64
+    write = lambda radius: np.savetxt(scene.parent / "walls.txt", radius * np.stack([np.cos(t), np.sin(t)], axis=1))
+    table = '[walls]\nkind = "file"\nfile = "walls.txt"\nomega = 50.0\nspacing = 0.08\n'
+    scene.write_text(scene.read_text().replace(SCENE[SCENE.index("[walls]") :], table))
+    write(0.8)
+    whole = finished(scene, "whole.h5")
+    finished(scene, "out.h5", "--set", f"time.horizon={2 * DT}")
+    write(0.9)
+    message = the_error(cli("run", scene, "-o", scene.parent / "out.h5", "--resume"), 2)
+    assert "restore walls.file" in message
+    write(0.8)
+    assert_same_frames(finished(scene, "out.h5", "--resume"), whole)
+
+
+def test_the_end_of_a_channel_is_named_where_a_vesicle_reaches_it(tmp_path):
+    path = tmp_path / "channel.toml"
+    path.write_text(
+        '[vesicles]\npoints = 16\ncenters = [[1.2, 0.0]]\n[walls]\nkind = "channel"\nlength = 3.0\nwidth = 0.4\nu_max = 100.0\n'
+        '[time]\ndt = 2e-4\nhorizon = 1.0\n[solver]\nkind = "split"\n'
+    )
+    message = the_error(cli("run", path, "-o", tmp_path / "out.h5", "--quiet"), 3)
+    assert "crosses a wall" in message
+    assert "a longer channel or a shorter time.horizon" in message
+
+
+def test_plan_does_not_factorise_large_walls(tmp_path):
+    path = tmp_path / "large.toml"
+    path.write_text('[vesicles]\npoints = 16\n[walls]\nkind = "circle"\nradius = 50.0\nomega = 1.0\n[time]\ndt = 1.0\nhorizon = 1.0\n')
+    printed = cli("plan", path).output
+    assert "10054 nodes" in printed
+    assert "to factorise, once; steps are not measured" in printed

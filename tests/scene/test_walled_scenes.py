@@ -107,7 +107,7 @@ def test_a_file_of_points_is_the_curve_through_them(tmp_path):
         ("1 2 3\n" * 16, "3 columns"),
         ("a b\n" * 16, "two columns"),
         ("", "no points"),
-        ("\n".join(f"{np.cos(t)} {np.sin(t) if k else np.nan}" for k, t in enumerate(np.arange(16) * np.pi / 8)), "finite"),
+        ("\n".join(f"{np.cos(t)} {np.sin(t) if k else np.nan}" for k, t in enumerate(np.arange(16) * np.pi / 8)), "point 0 is [1.0, nan]"),
         ("\n".join(f"{x} {y}" for x, y in np.random.default_rng(0).normal(size=(32, 2))), "do not resolve"),
     ],
 )
