@@ -152,16 +152,16 @@ def _draw_shapes(axes: Any, shapes: Mapping[str, np.ndarray], colors: np.ndarray
     energy = shapes["bending_energy"]
     by_energy = np.argsort(energy, kind="stable")
     last = len(energy) - 1
-    ranks = np.concatenate([np.linspace(0, last, ROWS * COLUMNS), np.linspace(HARD * last, last, COLUMNS)]).round().astype(int)
-    chosen = by_energy[ranks]
+    spread = [np.unique(np.linspace(low, last, most).round().astype(int)) for low, most in ((0, ROWS * COLUMNS), (HARD * last, COLUMNS))]
+    chosen = by_energy[np.concatenate(spread)]
     P = polygons(shapes["coefficients"][chosen])
     low, high = P.min(axis=(0, 1)), P.max(axis=(0, 1))
     step = np.array([1.1, 1.2]) * (high - low)
-    place = np.arange(len(chosen))
+    place = np.concatenate([np.arange(len(spread[0])), ROWS * COLUMNS + np.arange(len(spread[1]))])
     row = place // COLUMNS
     origin = np.stack([(place % COLUMNS) * step[0], -(row + 0.2 * (row == ROWS)) * step[1]], axis=-1)
     axes.add_collection(PolyCollection(list(P + origin[:, None]), facecolor=colors[chosen].tolist(), edgecolor="black", linewidth=0.5))
-    for k in place:
+    for k in range(len(chosen)):
         axes.text(origin[k, 0], origin[k, 1] + low[1] - 0.01, f"{energy[chosen[k]]:.3g}", ha="center", va="top", fontsize=6)
     axes.set_xlim(low[0] - 0.3 * step[0], (COLUMNS - 1) * step[0] + high[0] + 0.1 * step[0])
     axes.set_ylim(-(ROWS + 0.3) * step[1] + low[1], high[1] + 0.1 * step[1])
