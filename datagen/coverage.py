@@ -124,8 +124,8 @@ def _picture(stats: Mapping[str, Any], shapes: Mapping[str, np.ndarray]) -> byte
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic([list(LABELS), ["shapes"] * len(LABELS)], height_ratios=[1.0, 2.0])
     families = np.unique(shapes["family"])
-    palette = colormaps["tab10" if len(families) <= 10 else "tab20"].colors  # type: ignore[attr-defined]
-    colors = [palette[k % len(palette)] for k in range(len(families))]
+    palette = colormaps["tab10" if len(families) <= 10 else "tab20"]
+    colors = [palette(k % palette.N) for k in range(len(families))]
     for name, label in LABELS.items():
         _draw_histogram(axes[name], stats[name], label, list(stats["families"]), colors)
     axes["bending_energy"].legend(frameon=False, fontsize=8, title="family")

@@ -76,7 +76,8 @@ class Walls:
         """LU factors (2P, 2P) of the equations for [tau_x; tau_y]."""
         count("wall_factorization")
         P = len(self.nodes)
-        A = np.empty((2, P, 2, P))
+        A = np.empty((2 * P, 2 * P))
+        blocks = A.reshape(2, P, 2, P)
         x, y = self.nodes.T
         for k, (part, here) in enumerate(zip(self.parts, self.slices, strict=True)):
             rx, ry = x[:, None] - part.X[0], y[:, None] - part.X[1]
@@ -87,9 +88,8 @@ class Walls:
             bend = -part.curvature / (2.0 * pi)
             D_xx[on_itself], D_xy[on_itself], D_yy[on_itself] = bend * t[0] ** 2, bend * t[0] * t[1], bend * t[1] ** 2
             weight = part.ds if k == 0 else -part.ds
-            A[0, :, 0, here], A[1, :, 1, here] = weight * D_xx, weight * D_yy
-            A[0, :, 1, here] = A[1, :, 0, here] = weight * D_xy
-        A = A.reshape(2 * P, 2 * P)  # type: ignore[assignment]
+            blocks[0, :, 0, here], blocks[1, :, 1, here] = weight * D_xx, weight * D_yy
+            blocks[0, :, 1, here] = blocks[1, :, 0, here] = weight * D_xy
         A[np.arange(2 * P), np.arange(2 * P)] -= 0.5
         for source, moments in zip(self._sources(self.nodes), self._moments, strict=True):
             A += source.transpose(1, 0, 2).reshape(2 * P, 3) @ moments
