@@ -1,5 +1,7 @@
 """Options and fixtures of several test files."""
 
+import shutil
+import subprocess
 import sys
 
 import datagen_fakes
@@ -33,3 +35,21 @@ def fakes(monkeypatch):
     """Stages that compute next to nothing in place of those of datagen."""
     for name, module in datagen_fakes.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
+
+
+@pytest.fixture
+def kilobytes():
+    """Size of the small disk; a file of tests may have its own."""
+    return 128
+
+
+@pytest.fixture
+def small_disk(tmp_path, kilobytes):
+    """A disk that is soon full."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("no right to mount a small disk")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)

@@ -2,7 +2,6 @@
 
 import resource
 import shutil
-import subprocess
 
 import pytest
 from datagen_fakes import MPIRUN, TASKS, cli, contents, ranks_run, run, start
@@ -54,15 +53,8 @@ def test_files_that_may_not_grow_end_the_run_and_the_next_one_goes_on(tmp_path, 
 
 
 @pytest.fixture
-def small_disk(tmp_path):
-    """A disk of 64 KiB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("no right to mount a small disk")
-    yield folder
-    subprocess.run(["umount", "-l", str(folder)], check=True)
+def kilobytes():
+    return 64
 
 
 @pytest.mark.parametrize("ranks", [1, 2])

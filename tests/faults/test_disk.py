@@ -2,7 +2,6 @@
 
 import resource
 import shutil
-import subprocess
 
 import numpy as np
 import pytest
@@ -117,18 +116,6 @@ def test_run_without_room_for_merging_keeps_its_frames_and_resumes(tmp_path):
     assert cli("run", path, "-o", out, "--resume", "--quiet").exit_code == 0
     assert_same_frames(read_trajectory(out), whole)
     assert "out.h5" in error_line(printed, exit_code, 5)
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A disk of 128 KiB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("no right to mount a small disk")
-    yield folder
-    subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
 def test_disk_full_on_the_way_keeps_what_was_written_and_resumes(tmp_path, small_disk):
