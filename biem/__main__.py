@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter
 from pathlib import Path
@@ -31,6 +32,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 ScenePath = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE", show_default=False)]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="Override a key: --set vesicles.points=32.", metavar="KEY=VALUE")]
 SolverName = Annotated[str | None, typer.Option("--solver", help="Override solver.kind.")]
+WeightsFolder = Annotated[Path | None, typer.Option("--weights", help="Override solver.weights: a folder.", metavar="DIR")]
 TrajectoryPath = Annotated[Path, typer.Argument(help="Trajectory (HDF5).", metavar="TRAJECTORY", show_default=False)]
 
 
@@ -42,13 +44,14 @@ def run(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the output.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an output that exists.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+    weights: WeightsFolder = None,
     overrides: Overrides = None,
 ) -> None:
     """Run a scene to its horizon; under mpirun, its vesicles shared among the processes."""
     with one_line_errors():
         ranks = world()
     with one_line_errors(ranks):
-        loaded = ranks.together(lambda: _load(scene, solver, overrides))
+        loaded = ranks.together(lambda: _load(scene, solver, weights, overrides))
         path = output or Path(loaded.output.trajectory or f"out/{loaded.name}.h5")
         notices = ranks.on_root(lambda: build(loaded).notices if loaded.vesicles.file else ())
         for notice in notices if ranks.rank == 0 else ():
@@ -63,12 +66,13 @@ def plan(
     scene: ScenePath,
     solver: SolverName = None,
     measure: Annotated[bool, typer.Option(help="Time two steps for the estimate.")] = True,
+    weights: WeightsFolder = None,
     overrides: Overrides = None,
 ) -> None:
     """Print what a scene requires, and why, with memory, file size and time."""
     first_rank_only()
     with one_line_errors():
-        problem = build(_load(scene, solver, overrides))
+        problem = build(_load(scene, solver, weights, overrides))
         M, _, N = problem.X.shape
         adaptive = problem.scene.time.adaptive
         steps = "adaptive steps, their number not known, the first one of" if adaptive else f"{problem.steps} steps of"
@@ -118,8 +122,13 @@ def verify(trajectory: TrajectoryPath) -> None:
             fail(f"{failed} of {len(checks)} checks failed on {trajectory}", 3)
 
 
-def _load(path: Path, solver: str | None, overrides: list[str] | None) -> Scene:
-    return load_scene(path, [*(overrides or []), *([f'solver.kind="{solver}"'] if solver else [])])
+def _load(path: Path, solver: str | None, weights: Path | None, overrides: list[str] | None) -> Scene:
+    settings = list(overrides or [])
+    if solver:
+        settings.append(f'solver.kind="{solver}"')
+    if weights is not None:
+        settings.append(f"solver.weights={json.dumps(str(weights.absolute()), ensure_ascii=False)}")
+    return load_scene(path, settings)
 
 
 def _in_flow_times(problem: Problem) -> str:
@@ -153,6 +162,10 @@ def _summary(trajectory: Trajectory, path: Path, counts: Counter[str], ranks: Ra
     if trajectory.X.shape[1] > 1:
         gmres = d["gmres_iterations"].max()
         lines.append(f"smallest gap {d['min_gap'].min():.4g}" + (f"; at most {gmres:.0f} GMRES iterations a step" if gmres else ""))
+    if "out_of_distribution" in d:
+        outside, exact = d["out_of_distribution"].max(), d.get("by_exact_maps", np.zeros(1)).max()
+        lines.append(f"outside the training distribution: at most {outside:.0f} of {trajectory.X.shape[1]} vesicles in a step")
+        lines[-1] += f"; by exact maps: at most {exact:.0f}" if exact else ""
     lines.append("used: " if ranks.size == 1 else f"used by the first of {ranks.size} processes: ")
     lines[-1] += ", ".join(f"{name} {n}" for name, n in sorted(counts.items()))
     return "\n".join(lines)

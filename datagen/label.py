@@ -37,7 +37,7 @@ from biem.stokes.near_search import locate
 from datagen.config import Label, MapName
 
 CHUNK = 8  # shapes worked on at once: their matrices stay in the cache
-LENGTH_TOLERANCE = 1e-6  # of the length 1 of a standardized shape
+LENGTH_TOLERANCE = 1e-3  # of the length 1 of a standardized shape: a low-pass to few operator points shortens the roughest
 NEAR_TOLERANCE = 1e-9  # of the layers off the curve: below what float32 shows
 Labels = dict[str, np.ndarray]
 

@@ -2,13 +2,17 @@
 
 All maps are batched over M vesicles in the world frame. `ExactMaps` builds its operators on `points` nodes of the resampled curve
 and reads velocities and tensions back on the N nodes it was given; 2 N removes the aliasing of P and T that dominates at small N.
+Other realisations are made elsewhere, from a `MapsRequest`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
+import numpy as np
 from array_api_compat import array_namespace
 
 from biem.backend import Array, Latest
@@ -17,6 +21,7 @@ from biem.curves.fourier import read_back, resample
 from biem.membrane.resultants import Resultants
 from biem.stokes.near import layer_values
 
+SLOTS = ("relax", "self_tension", "advection", "flow_tension", "near")  # the maps by the names that scenes and weights give them
 LAYERS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # offsets of the near layers along the outward normal, in arclength spacings
 RESOLVED_FROM = 96  # nodes from which the operators are built at N itself
 
@@ -43,6 +48,43 @@ class MembraneMaps(Protocol):
     def near_layers(self, X: Array, f: Array) -> Array:
         """S[X, f] at X + offset h n for the offsets LAYERS, h = length/N (M, n_layers, 2, N)."""
         ...
+
+
+@runtime_checkable
+class Monitored(Protocol):
+    """What maps that know the limits of their validity offer besides."""
+
+    def diagnostics(self, X: Array) -> Mapping[str, float]:
+        """Of vesicles X (M, 2, N), by name: how many are "out_of_distribution", how many are answered "by_exact_maps"; counts add up."""
+        ...
+
+
+@dataclass(frozen=True)
+class MapsRequest:
+    """What a scene asks of a maker of maps: `make_maps(request) -> MembraneMaps`.
+
+    kinds: of every slot, "ivnet", "mlp", "hybrid" or "exact"; needed: the slots that the scene requires, the only ones to be loaded.
+    weights: the folder, or None for the shipped ones. kappa_b, mu, X: in the scene's units, X (M, 2, N) the membranes at the start.
+    dt: the scene's time step; dts: it and, where each step is made against two halves, the half. adaptive: these are the first steps,
+    later ones may be longer or shorter. Beyond dts, `relax` is also called once with dt/2, on trial, in the first step of vesicles that
+    move, and with what is left to the horizon in the last one. operator_points, dtype ("float64" or "float32"), device: as in the
+    scene; the arrays that the maps are given say where they are. out_of_distribution: vesicles unlike those that a map was made for are
+    counted ("flag"), answered by exact maps and counted ("exact"), or raise NumericalFailure that names the vesicle ("refuse").
+    """
+
+    kinds: Mapping[str, str]
+    needed: frozenset[str]
+    weights: Path | None
+    kappa_b: float
+    mu: float
+    X: np.ndarray
+    dt: float
+    dts: tuple[float, ...]
+    adaptive: bool
+    operator_points: int | None
+    dtype: str
+    device: str
+    out_of_distribution: str
 
 
 def operator_points(N: int, points: int | None = None) -> int:

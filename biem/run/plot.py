@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from biem.backend import to_numpy
 from biem.curves.curve import centroid, effective_radius
 from biem.curves.fourier import resample
-from biem.run.trajectory import Trajectory
+from biem.run.trajectory import MONITORED, Trajectory
 
 FACE, EDGE, WALL = "#e8a33d", "#7a3b00", "#4a5560"
 MOST_PATHS = 200  # of vesicles drawn one by one
@@ -120,7 +120,9 @@ def _snapshots(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) 
 
 def _history(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) -> Path:
     d = trajectory.diagnostics
-    figure, axes = _figure(7.0, 7.0, 3, 1, sharex=True)
+    monitored = [name for name in MONITORED if name in d]
+    rows = 3 + bool(monitored)
+    figure, axes = _figure(7.0, 7.0 * rows / 3, rows, 1, sharex=True)
     axes[0].plot(time, d["bending_energy"], color=EDGE)
     axes[0].set_ylabel("bending energy")
     for name, label in (("area_error", "area"), ("length_error", "length")):
@@ -136,7 +138,11 @@ def _history(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) ->
     else:
         axes[2].plot(time[1:], d["wall_seconds"][1:], color="tab:gray")
         axes[2].set_ylabel("seconds a step")
-    axes[2].set_xlabel(unit)
+    for name in monitored:
+        axes[3].step(time[1:], d[name][1:], label=name.replace("_", " "))
+        axes[3].set_ylabel("vesicles, at most")
+        axes[3].legend(frameon=False)
+    axes[-1].set_xlabel(unit)
     figure.savefig(path, dpi=130)
     return path
 

@@ -26,7 +26,7 @@ from biem.run.checkpoint import Checkpoint
 from biem.run.guard import check_state
 from biem.run.output import Output, where_to_resume
 from biem.run.solver import make_stepper, on_device
-from biem.run.trajectory import SCHEMA, Trajectory, one_frame
+from biem.run.trajectory import MONITORED, SCHEMA, Trajectory, one_frame
 from biem.scene.build import Problem, build
 from biem.scene.config import Scene
 from biem.steppers.control import Controller, add_time
@@ -225,7 +225,7 @@ class _Loop:
         self.step += 1
         self.latest = {**result.diagnostics, "dt": dt}
         r = self.running
-        for name in WORST:
+        for name in (*WORST, *(name for name in MONITORED if name in result.diagnostics)):
             r[name] = max(r.get(name, 0.0), float(result.diagnostics.get(name, 0.0)))
         work = result.diagnostics.get("repulsion_work", 0.0)
         for name, value in (("steps", 1), ("rejected", rejected), ("repulsion_work", work), ("seconds", time.perf_counter() - begin)):
@@ -289,6 +289,7 @@ def _frame(problem: Problem, step: int, state: State, running: dict[str, float])
     X = to_numpy(state.X)
     sigma = None if state.sigma is None else to_numpy(state.sigma)
     diagnostics = {name: running.get(name, 0.0) for name in (*WORST, "dt", "rejected", "repulsion_work")}
+    diagnostics |= {name: running[name] for name in MONITORED if name in running}
     diagnostics["bending_energy"] = float(bending_energy(X, problem.scene.physics.kappa_b).sum())
     diagnostics["wall_seconds"] = running.get("seconds", 0.0) / max(1.0, running.get("steps", 0.0))
     diagnostics["min_gap"] = minimum_gap(X)

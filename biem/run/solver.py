@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
-from biem.membrane.maps import LAYERS, ExactMaps
+from biem.membrane.maps import LAYERS, ExactMaps, MapsRequest, MembraneMaps
 from biem.membrane.repulsion import Repulsion
 from biem.ranks import ALONE, Ranks
 from biem.scene.build import Problem
 from biem.scene.config import Scene
-from biem.scene.plan import memory_estimate
+from biem.scene.plan import memory_estimate, required_maps
 from biem.steppers.corrections import Corrected
 from biem.steppers.implicit import ImplicitStepper
 from biem.steppers.order import Extrapolated
 from biem.steppers.split import SplitStepper
 from biem.steppers.stepper import Flow, State, Stepper
 from biem.stokes.interaction import Fields
+
+LEARNED_MAPS = "surrogate.provider"  # has make_maps(MapsRequest) -> MembraneMaps; imported where a scene asks for it, by its name alone
 
 
 def check_device(name: str, key: str = "solver.device") -> int:
@@ -73,7 +76,7 @@ def make_stepper(problem: Problem, area_0: np.ndarray, length_0: np.ndarray, ran
         raise ValueError(f"{ranks.size} processes for {M} vesicle(s): start at most as many processes as vesicles")
     if ranks.size > 1 and scene.solver.kind == "implicit":
         raise ValueError('solver.kind = "implicit" runs in one process: leave out mpirun, or take solver.kind = "split"')
-    inner = _split(problem, ranks) if scene.solver.kind == "split" else _implicit(problem)
+    inner = _implicit(problem) if scene.solver.kind == "implicit" else _split(problem, ranks)
     if scene.time.order == 2 or scene.time.adaptive:
         inner = Extrapolated(inner, scene.time.order)
     return Corrected(inner, tuple(scene.solver.corrections), area_0, length_0, ranks)
@@ -114,7 +117,7 @@ def _implicit(problem: Problem) -> Stepper:
 def _split(problem: Problem, ranks: Ranks) -> Stepper:
     scene = problem.scene
     physics, solver = scene.physics, scene.solver
-    maps = ExactMaps(physics.kappa_b, physics.mu, solver.operator_points, solver.dtype)
+    maps = _maps(problem)
     fields = replace(_fields(scene), precision=solver.dtype, layers=maps.near_layers, offsets=LAYERS)
     return SplitStepper(
         maps,
@@ -129,9 +132,41 @@ def _split(problem: Problem, ranks: Ranks) -> Stepper:
     )
 
 
+def _maps(problem: Problem) -> MembraneMaps:
+    """The maps that the scene asks for. Raises ValueError where what makes them is not there, or has not what is asked for."""
+    physics, solver, time = problem.scene.physics, problem.scene.solver, problem.scene.time
+    kinds = solver.map_kinds
+    needed = frozenset(part.name for part in required_maps(problem) if part.needed)
+    if all(kinds[slot] == "exact" for slot in needed):
+        return ExactMaps(physics.kappa_b, physics.mu, solver.operator_points, solver.dtype)
+    try:
+        provider = import_module(LEARNED_MAPS)
+    except ImportError as error:
+        raise ValueError(
+            f'solver.kind = "vesnet" takes its maps from {LEARNED_MAPS}, which cannot be imported ({error}): install what is missing, '
+            'or choose solver.maps = "exact"'
+        ) from None
+    request = MapsRequest(
+        kinds=kinds,
+        needed=needed,
+        weights=None if solver.weights is None else problem.scene.folder / solver.weights,
+        kappa_b=physics.kappa_b,
+        mu=physics.mu,
+        X=problem.X,
+        dt=problem.dt,
+        dts=(problem.dt, 0.5 * problem.dt) if time.order == 2 or time.adaptive else (problem.dt,),
+        adaptive=time.adaptive,
+        operator_points=solver.operator_points,
+        dtype=solver.dtype,
+        device=solver.device,
+        out_of_distribution=solver.out_of_distribution,
+    )
+    return provider.make_maps(request)
+
+
 def _fields(scene: Scene) -> Fields:
     near, far = scene.solver.tolerances
-    return Fields(scene.solver.near_field, near, scene.solver.far_field, far)
+    return Fields(scene.solver.near_method, near, scene.solver.far_field, far)
 
 
 def _flow(problem: Problem) -> Flow | None:

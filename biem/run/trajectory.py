@@ -2,7 +2,7 @@
 
 out.h5: t (F,), step (F,), X (F, M, 2, N), sigma (F, M, N) where the solver has a tension, diagnostics/* (F,), walls/* (2, N_k) where
 there are walls, the outer one first, attributes.
-dt, error_estimate and rejected came later: files without them are read as zeros.
+dt, error_estimate and rejected came later: files without them are read as zeros. MONITORED are there in runs by learned maps alone.
 While a run is writing, new frames lie one file each in out.h5.frames/ and are merged into out.h5 from time to time and at the end;
 `read_trajectory` reads both. Every file appears by a rename after a sync.
 """
@@ -23,6 +23,7 @@ from biem.run.files import atomic_h5, one_line
 SCHEMA = 1
 REQUIRED = ("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap")
 DIAGNOSTICS = (*REQUIRED, "dt", "error_estimate", "rejected", "repulsion_work")
+MONITORED = ("out_of_distribution", "by_exact_maps")  # numbers of vesicles: of maps that watch over their validity
 MERGE_AT = 64  # loose frames, at least; more where the file is longer, so that merging costs a constant factor
 
 
@@ -33,6 +34,7 @@ class Trajectory:
     area_error and length_error are the largest relative errors of a step since the last frame, before correction; bending_energy is
     the suspension's; gmres_iterations the most since the last frame; wall_seconds the mean of a step since then; min_gap is at t; dt is
     of the last step; error_estimate the worst since the last frame, zero where there is none; rejected the steps rejected since then.
+    MONITORED, where there are any, are the most vesicles in a step since the last frame.
     attributes["walls"]: the curves (2, N_k) of the walls, where there are any.
     """
 
@@ -61,7 +63,8 @@ class Trajectory:
 
 def one_frame(t: float, step: int, X: np.ndarray, sigma: np.ndarray | None, diagnostics: Mapping[str, float]) -> Trajectory:
     """A trajectory of one frame."""
-    values = {name: np.array([diagnostics.get(name, 0.0)], dtype=np.float64) for name in DIAGNOSTICS}
+    names = (*DIAGNOSTICS, *(name for name in MONITORED if name in diagnostics))
+    values = {name: np.array([diagnostics.get(name, 0.0)], dtype=np.float64) for name in names}
     return Trajectory(np.array([t]), np.array([step]), X[None], None if sigma is None else sigma[None], values, {})
 
 
@@ -71,7 +74,8 @@ def join(parts: list[Trajectory], attributes: Mapping[str, Any]) -> Trajectory:
     sigma = None
     if with_tension:
         sigma = np.concatenate([np.zeros((len(p), *p.X.shape[1:2], p.X.shape[3])) if p.sigma is None else p.sigma for p in parts])
-    diagnostics = {name: np.concatenate([p.diagnostics[name] for p in parts]) for name in DIAGNOSTICS}
+    names = (*DIAGNOSTICS, *(name for name in MONITORED if any(name in p.diagnostics for p in parts)))
+    diagnostics = {name: np.concatenate([p.diagnostics.get(name, np.zeros(len(p))) for p in parts]) for name in names}
     t, step, X = (np.concatenate([getattr(p, name) for p in parts]) for name in ("t", "step", "X"))
     return Trajectory(t, step, X, sigma, diagnostics, dict(attributes))
 
@@ -170,7 +174,8 @@ def _read(path: Path) -> Trajectory:
                 raise ValueError(f"{path} is not a trajectory of schema {SCHEMA}: {lacks}")
             sigma = file["sigma"][:] if "sigma" in file else None
             t, stored = file["t"][:], file["diagnostics"]
-            diagnostics = {name: stored[name][:] if name in stored else np.zeros(len(t)) for name in DIAGNOSTICS}
+            names = (*DIAGNOSTICS, *(name for name in MONITORED if name in stored))
+            diagnostics = {name: stored[name][:] if name in stored else np.zeros(len(t)) for name in names}
             attributes = dict(file.attrs)
             if "walls" in file:
                 attributes["walls"] = tuple(file[f"walls/{k}"][:] for k in range(len(file["walls"])))

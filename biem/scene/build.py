@@ -22,6 +22,15 @@ MOST_STEPS = 1e12
 LARGEST_SHRINKAGE = 1000.0  # of adaptive steps, from the first one
 LEAST_TOLERANCE = 1e-9  # of adaptive steps
 WALL_NODES_PER_LENGTH = 32  # on walls, by default, per membrane length
+SOLVERS_WITH = {  # keys of [solver] that not every kind takes
+    "device": ("split", "vesnet"),
+    "dtype": ("split", "vesnet"),
+    "tolerance": ("implicit",),
+    "max_iterations": ("implicit",),
+    "maps": ("vesnet",),
+    "weights": ("vesnet",),
+    "out_of_distribution": ("vesnet",),
+}
 SHAPES = {"equilibrium": equilibrium, "ellipse": ellipse}
 
 
@@ -86,13 +95,14 @@ def build(scene: Scene) -> Problem:
 def _check_solver(scene: Scene) -> None:
     """Options that the solver does not have, and tolerances that the precision does not give."""
     solver = scene.solver
-    only = {"implicit": ("device", "dtype"), "split": ("tolerance", "max_iterations")}[solver.kind]
-    for key in only:
-        if getattr(solver, key) != Solver.model_fields[key].default:
-            other = "split" if solver.kind == "implicit" else "implicit"
-            raise ValueError(f'solver.{key} goes with solver.kind = "{other}"; remove it or choose that solver')
+    for key, kinds in SOLVERS_WITH.items():
+        if solver.kind not in kinds and getattr(solver, key) != Solver.model_fields[key].default:
+            others = " or ".join(f'"{kind}"' for kind in kinds)
+            raise ValueError(f"solver.{key} goes with solver.kind = {others}; remove it or choose that solver")
     if solver.kind == "implicit" and solver.near_field.startswith("layers"):
         raise ValueError(f'solver.near_field = "{solver.near_field}" goes with solver.kind = "split"; "implicit" takes "upsample"')
+    if solver.weights is not None and not (scene.folder / solver.weights).is_dir():
+        raise ValueError(f"solver.weights {scene.folder / solver.weights} is no folder of weights (paths are relative to the scene)")
     if solver.dtype == "float32":
         for key in ("near_tolerance", "far_tolerance"):
             value = getattr(solver, key)

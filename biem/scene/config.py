@@ -5,16 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, field_validator
 
+from biem.membrane.maps import SLOTS
 from biem.scene.tables import Table, read_toml, validated
 
 Kind = Literal["quiescent", "shear", "extensional", "poiseuille", "taylor_green", "rotation", "custom"]
+MapKind = Literal["ivnet", "mlp", "hybrid", "exact"]
+MAP_KINDS = '"ivnet", "mlp", "hybrid" or "exact"'
 TIMES = 'a positive, finite number or a number and a unit, as in "0.01 t_gamma"'
 EXPECTED = {  # for keys whose types or patterns say it badly
     "solver.device": '"cpu" (NumPy), "torch" (PyTorch on the CPU), "cuda" or "cuda:N"',
+    **{f"solver.maps.{slot}": MAP_KINDS for slot in SLOTS},
+    "solver.maps": f"{MAP_KINDS}, or a table of them with the keys {', '.join(SLOTS)}",
     "time.dt": TIMES,
     "time.horizon": TIMES,
     "time.dt_min": TIMES,
@@ -118,12 +123,33 @@ class RepulsionTable(Table):
     strength: float = Field(1e3, gt=0)
 
 
-class Solver(Table):
-    """The solver and what it is allowed to do. "implicit" runs in float64 on the CPU; "split" also on devices and in mixed precision."""
+class MapsTable(Table):
+    """What each of a vesicle's maps is made by; those that are not named are exact."""
 
-    kind: Literal["implicit", "split"] = "implicit"
+    relax: MapKind = "exact"
+    self_tension: MapKind = "exact"
+    advection: MapKind = "exact"
+    flow_tension: MapKind = "exact"
+    near: MapKind = "exact"  # there is no hybrid one: it is exact
+
+    @classmethod
+    def of_all(cls, kind: MapKind) -> MapsTable:
+        """All maps of one kind."""
+        return cls(relax=kind, self_tension=kind, advection=kind, flow_tension=kind, near=kind)
+
+
+class Solver(Table):
+    """The solver and what it is allowed to do. "implicit" runs in float64 on the CPU; "split" also on devices and in mixed precision.
+
+    "vesnet" is "split" with maps by networks, alone ("ivnet", "mlp") or as corrections to exact ones ("hybrid").
+    """
+
+    kind: Literal["implicit", "split", "vesnet"] = "implicit"
     device: str = Field("cpu", pattern=r"^(cpu|torch|cuda(:\d+)?)$")  # split; "cpu": NumPy, "torch": PyTorch on the CPU, "cuda", "cuda:1"
     dtype: Literal["float64", "float32"] = "float64"  # split; of kernels, solves and pair sums: geometry and forces are float64
+    maps: MapsTable = Field(MapsTable.of_all("hybrid"))  # vesnet; one kind for all, or a table by map: those not named are exact
+    weights: str | None = None  # vesnet; folder of weights, default the shipped ones
+    out_of_distribution: Literal["flag", "exact", "refuse"] = "flag"  # vesnet; vesicles unlike the training data: counted, by exact maps
     tolerance: float = Field(1e-10, gt=0, lt=1)  # implicit: of GMRES, relative
     max_iterations: int = Field(200, ge=1)  # implicit: of GMRES
     operator_points: int | None = Field(None, ge=16, multiple_of=2)
@@ -135,10 +161,27 @@ class Solver(Table):
     corrections: list[Correction] = Field(["area_length", "redistribute"])
     max_error: float = Field(1e-2, gt=0)  # relative error of area or length in one step (since the start, if not corrected)
 
+    @field_validator("maps", mode="before")
+    @classmethod
+    def _one_kind_for_all(cls, maps: Any) -> Any:
+        return dict.fromkeys(SLOTS, maps) if isinstance(maps, str) and maps in get_args(MapKind) else maps
+
+    @property
+    def map_kinds(self) -> dict[str, str]:
+        """By slot, what each map is made by."""
+        if self.kind != "vesnet":
+            return dict.fromkeys(SLOTS, "exact")
+        return {slot: "exact" if (slot, kind) == ("near", "hybrid") else kind for slot, kind in self.maps.model_dump().items()}
+
+    @property
+    def near_method(self) -> str:
+        """near_field, where "auto" gives way to the layers that a network for them is made for."""
+        return "layers" if self.near_field == "auto" and self.map_kinds["near"] != "exact" else self.near_field
+
     @property
     def tolerances(self) -> tuple[float, float]:
         """Of the near and of the far field."""
-        near, far = {"implicit": (1e-8, 1e-10), "split": (1e-6, 1e-6)}[self.kind]
+        near, far = (1e-8, 1e-10) if self.kind == "implicit" else (1e-6, 1e-6)
         if self.dtype == "float32":
             near = far = FLOAT32_TOLERANCE
         return self.near_tolerance or near, self.far_tolerance or far

@@ -7,13 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from biem.backend import threads
-from biem.membrane.maps import operator_points
+from biem.membrane.maps import LAYERS, operator_points
 from biem.membrane.resultants import CPU_CHUNK, DEVICE_CHUNK
 from biem.scene.build import Problem
+from biem.scene.config import Solver
 from biem.stokes.farfield import far_field_bytes, far_scheme
 from biem.stokes.near import near_width
 from biem.stokes.near_layers import METHODS
 from biem.stokes.single_layer import near_scheme
+
+DENSE = ("exact", "hybrid")  # maps that factorise a dense matrix
+MATRICES = {"self_tension": 0.0, "advection": 1.0, "flow_tension": 0.5, "near": len(LAYERS)}  # values over those of a (2N, 2N) matrix
 
 
 @dataclass(frozen=True)
@@ -30,15 +34,15 @@ def required_parts(problem: Problem) -> list[Part]:
     M = problem.X.shape[0]
     solver, output, time = problem.scene.solver, problem.scene.output, problem.scene.time
     walled = problem.walls is not None
-    many, flowing, split = M > 1, problem.flow.kind != "quiescent", solver.kind == "split"
-    moved = ", ".join(["the flow"] * flowing + ["the other vesicles"] * many + ["the walls' answer"] * walled)
+    many, flowing, split = M > 1, problem.flow.kind != "quiescent", solver.kind != "implicit"
+    maps = required_maps(problem)
+    solved = ": one dense solve a vesicle" if solver.map_kinds["relax"] in DENSE else ""
     parts = [
-        Part("relaxation", True, "bending is implicit: one dense solve a vesicle"),
+        Part("relaxation", True, f"bending is implicit{solved}"),
         Part("background flow", flowing, _flow(problem)),
     ]
     if split:
-        needed = many or flowing or walled
-        parts.append(Part("advection", needed, f"the velocity by {moved} is made inextensible" if needed else "nothing moves the vesicle"))
+        parts.append(next(part for part in maps if part.name == "advection"))
     parts.append(
         Part(
             "tension",
@@ -62,7 +66,35 @@ def required_parts(problem: Problem) -> list[Part]:
         Part("step size control", time.adaptive, f"time.tolerance = {time.tolerance:g}" if time.adaptive else "time.adaptive = false"),
         _walls(problem),
     ]
+    if solver.kind == "vesnet":
+        parts += [Part(f"map {p.name}", p.needed, f"{solver.map_kinds[p.name]}: {p.why}" if p.needed else p.why) for p in maps]
     return parts
+
+
+def required_maps(problem: Problem) -> list[Part]:
+    """The maps of `biem.membrane.maps` by their slots, as a split step of this scene calls them."""
+    M = problem.X.shape[0]
+    solver, asked = problem.scene.solver, problem.scene.output.tension
+    many, flowing, walled = M > 1, problem.flow.kind != "quiescent", problem.walls is not None
+    moved = ", ".join(["the flow"] * flowing + ["the other vesicles"] * many + ["the walls' answer"] * walled)
+    still = "nothing moves the vesicle"
+    wanted = "its force moves the other vesicles" if many else "the walls answer to its force" if walled else _asked(asked)
+    tension = many or walled or asked
+    near = "one vesicle"
+    if many or walled:
+        near = f'solver.near_field = "{solver.near_field}"' + (f", that is {_near_name(solver)}" if solver.near_field == "auto" else "")
+    return [
+        Part("relax", True, "bending is implicit"),
+        Part("self_tension", tension, f"tension by bending: {wanted}"),
+        Part("advection", bool(moved), f"the velocity by {moved} is made inextensible" if moved else still),
+        Part("flow_tension", tension and bool(moved), f"tension by {moved}: {wanted}" if moved else still),
+        Part("near", (many or walled) and solver.near_method in METHODS, near),
+    ]
+
+
+def _near_name(solver: Solver) -> str:
+    """The near field without "auto"."""
+    return solver.near_method if solver.near_method in METHODS else near_scheme(solver.near_method)
 
 
 def _flow(problem: Problem) -> str:
@@ -77,7 +109,7 @@ def _asked(wanted: bool) -> str:
 def _walls(problem: Problem) -> Part:
     if problem.walls is None:
         return Part("walls", False, "none in the scene")
-    how = "one explicit velocity" if problem.scene.solver.kind == "split" else "within GMRES"
+    how = "within GMRES" if problem.scene.solver.kind == "implicit" else "one explicit velocity"
     bodies = len(problem.walls.curves) - 1
     around = "an outer wall" + (f" and {bodies} {'body' if bodies == 1 else 'bodies'}" if bodies else "")
     return Part("walls", True, f"{around}, {len(problem.walls.nodes)} nodes, factorised once: {how}")
@@ -85,13 +117,13 @@ def _walls(problem: Problem) -> Part:
 
 def _near_field(problem: Problem) -> Part:
     solver = problem.scene.solver
-    layered = solver.near_field in METHODS
-    scheme = "upsample" if layered else near_scheme(solver.near_field)
+    layered = solver.near_method in METHODS
+    scheme = "upsample" if layered else near_scheme(solver.near_method)
     if scheme == "none":
         return Part("near field", False, 'solver.near_field = "none"')
     others = "another" if problem.walls is None else "another or of a wall"
     where = f"{scheme}, on demand: where a membrane is within {near_width(scheme, solver.tolerances[0]):.1f} h of {others}"
-    return Part("near field", True, where + (f"; {solver.near_field} within 1 h" if layered else ""))
+    return Part("near field", True, where + (f"; {solver.near_method} within 1 h" if layered else ""))
 
 
 def _far_field(problem: Problem) -> Part:
@@ -120,16 +152,25 @@ def memory_estimate(problem: Problem) -> float:
     if problem.walls is not None:
         P = len(problem.walls.nodes)
         far += 8.0 * 2 * (2 * P) ** 2 + 16.0 * sum(X.shape[1] ** 2 for X in problem.walls.curves)  # the equations while they are made
-    if solver.kind == "split":
+    if solver.kind != "implicit":
         chunk = min(M * n**2, threads() * CPU_CHUNK if solver.device in ("cpu", "torch") else DEVICE_CHUNK)
-        factors = size * M * n**2 if M > 1 or problem.flow.kind != "quiescent" or problem.walls is not None else 0.0
-        return factors + 12 * 8.0 * chunk + 8.0 * (24 * M * 2 * n + 40 * M * 2 * N + 16 * near_pairs) + far
+        maps = _maps_bytes(problem, n, size)
+        return maps + 12 * 8.0 * chunk + 8.0 * (24 * M * 2 * n + 40 * M * 2 * N + 16 * near_pairs) + far
     one_chunk = 16 * (2 * n) ** 2  # operators of the vesicles in work
     if M == 1 and problem.walls is None:
         return 8.0 * one_chunk
     response = M * (2 * N) * (5 * N)
     krylov = 2 * M * N * 40
     return 8.0 * (2 * one_chunk + 2 * response + krylov + near_pairs * 4 * N) + far
+
+
+def _maps_bytes(problem: Problem, n: int, size: float) -> float:
+    """What maps keep of every vesicle: exact ones the factors that all but relax share, networks the matrix that a map is, in float32."""
+    M, _, N = problem.X.shape
+    kinds = problem.scene.solver.map_kinds
+    kept = [part.name for part in required_maps(problem) if part.needed and part.name in MATRICES]
+    factors = size * M * n**2 if any(kinds[slot] in DENSE for slot in kept if slot != "near") else 0.0
+    return factors + 4.0 * M * (2 * N) ** 2 * sum(MATRICES[slot] for slot in kept if kinds[slot] != "exact")
 
 
 def trajectory_bytes(problem: Problem) -> float:

@@ -34,8 +34,8 @@ def read_toml(path: Path, kind: str, example: str, overrides: Iterable[str] = ()
         raise ValueError(f"{kind} {path} is a folder: give the path of a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{kind} {path} is not valid TOML: {error}") from None
-    for override in overrides:
-        _override(table, override)
+    for text in overrides:
+        override(table, text)
     return table
 
 
@@ -58,19 +58,20 @@ def flat(table: Mapping[str, Any] | list[Any], prefix: str = "") -> dict[str, An
     return values
 
 
-def _override(table: dict[str, Any], override: str) -> None:
-    key, equals, text = override.partition("=")
+def override(table: dict[str, Any], text: str) -> None:
+    """Sets a key of nested tables, as in "vesicles.points=32". Raises ValueError."""
+    key, equals, right = text.partition("=")
     if not equals or not key.strip():
-        raise ValueError(f'--set {override}: expected key=value, as in "vesicles.points=32"')
+        raise ValueError(f'--set {text}: expected key=value, as in "vesicles.points=32"')
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        value = tomllib.loads(f"value = {right}")["value"]
     except tomllib.TOMLDecodeError:
-        value = text
+        value = right
     *parents, last = key.strip().split(".")
     for parent in parents:
         table = table.setdefault(parent, {})
         if not isinstance(table, dict):
-            raise ValueError(f"--set {override}: {parent} is not a table")
+            raise ValueError(f"--set {text}: {parent} is not a table")
     table[last] = value
 
 

@@ -11,13 +11,13 @@ order (Adams-Bashforth); the splitting and the relaxation are of first order. Pa
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 from array_api_compat import array_namespace
 
 from biem.backend import Array, Latest, one_blas_thread, stage
-from biem.membrane.maps import MembraneMaps
+from biem.membrane.maps import MembraneMaps, Monitored
 from biem.membrane.operators import bending_force, tension_force
 from biem.membrane.repulsion import Repulsion, work_of
 from biem.ranks import ALONE, Ranks
@@ -31,13 +31,17 @@ FIRST_SWEEPS, FIRST_CHANGE = 20, 1e-6  # of the fixed-point iteration at the sta
 
 @dataclass(frozen=True)
 class _Advection:
-    """What a step takes from X^n. velocity u and its rate: None where nothing moves the vesicles; sigma: None where nobody asks for it."""
+    """What a step takes from X^n. velocity u and its rate: None where nothing moves the vesicles; sigma: None where nobody asks for it.
+
+    monitored: what maps say of X^n that watch over their validity, of all ranks.
+    """
 
     X_mine: Array  # one array for all maps of a step, so that they can share their factors
     velocity: Array = None
     rate: Array = None
     sigma: Array | None = None
     repulsive: Array | None = None
+    monitored: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -64,10 +68,19 @@ class SplitStepper:
         """The state at t + dt; sigma is the tension at t."""
         with one_blas_thread():
             # steps of different dt from one state, as extrapolation makes them, share everything but the relaxation
-            a = self._advection.of(state, lambda: self._advect(state, dt))
+            a = self._advection.of(state, lambda: self._monitor(state.X, self._advect(state, dt)))
             X = self._move(state.X, a, dt)
         coupling = None if a.velocity is None else (state.t, a.velocity, a.rate)
-        return StepResult(State(state.t + dt, X, a.sigma, coupling), work_of(a.repulsive, state.X, X - state.X))
+        return StepResult(State(state.t + dt, X, a.sigma, coupling), {**work_of(a.repulsive, state.X, X - state.X), **a.monitored})
+
+    def _monitor(self, X: Array, a: _Advection) -> _Advection:
+        """With what the maps say of X, summed over the ranks."""
+        maps = self.maps
+        if not isinstance(maps, Monitored):
+            return a
+        _, told = self.ranks.gather_all(X.shape[0], lambda mine: (a.X_mine[:, 0, 0], maps.diagnostics(a.X_mine)))
+        names = dict.fromkeys(name for counts in told for name in counts)
+        return replace(a, monitored={name: float(sum(counts.get(name, 0.0) for counts in told)) for name in names})
 
     def _move(self, X: Array, a: _Advection, dt: float) -> Array:
         M = X.shape[0]
@@ -80,7 +93,10 @@ class SplitStepper:
 
     def _advect(self, state: State, dt: float) -> _Advection:
         if self.flow is None and not self._coupled(state.X):
-            return _Advection(state.X, sigma=-self.maps.self_tension(state.X) if self.tension else None)
+            M = state.X.shape[0]
+            X_mine = state.X[self.ranks.mine(M)]
+            sigma = -self.ranks.gather(M, lambda mine: self.maps.self_tension(X_mine)) if self.tension else None
+            return _Advection(X_mine, sigma=sigma)
         if state.coupling is not None:
             return self._evaluate(state)
         start = self._evaluate(state)  # the rate is not known yet: it is taken from half a step on trial
