@@ -166,4 +166,4 @@ def stop_after(monkeypatch, steps):
     def signals():
         yield lambda: next(looks) >= steps
 
-    monkeypatch.setattr(loop, "_signals", signals)
+    monkeypatch.setattr(loop, "stop_signals", signals)

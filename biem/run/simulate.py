@@ -86,7 +86,7 @@ def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progre
         "schema": SCHEMA,
         "scene": resolved,
         "solver": scene.solver.kind,
-        "commit": _commit(),
+        "commit": commit(),
         "seed": scene.vesicles.seed,
         "t_gamma": problem.flow.time_scale or 0.0,
         "flow_width": problem.flow.width or 0.0,
@@ -137,7 +137,7 @@ class _Loop:
         scene = self.problem.scene
         every = scene.time.save_every
         checkpoint_every = scene.output.checkpoint_every or every
-        with _signals() as stop, self._bar() as bar:
+        with stop_signals() as stop, self._bar() as bar:
             while not self._done():
                 try:
                     if self.controller is None:
@@ -299,7 +299,7 @@ def _frame(problem: Problem, step: int, state: State, running: dict[str, float])
 
 
 @contextmanager
-def _signals() -> Iterator[Callable[[], bool]]:
+def stop_signals() -> Iterator[Callable[[], bool]]:
     """Whether SIGTERM or SIGINT has come; a second one ends the process at once."""
     seen: list[int] = []
 
@@ -319,7 +319,7 @@ def _signals() -> Iterator[Callable[[], bool]]:
             signal.signal(s, handler)
 
 
-def _commit() -> str:
+def commit() -> str:
     here = Path(__file__).parent
     try:
         done = subprocess.run(["git", "-C", here, "rev-parse", "HEAD"], capture_output=True, text=True, check=True, timeout=10)

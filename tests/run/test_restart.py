@@ -33,7 +33,7 @@ def stop_at(monkeypatch, looks):
     def signals():
         yield stop
 
-    monkeypatch.setattr(loop, "_signals", signals)
+    monkeypatch.setattr(loop, "stop_signals", signals)
 
 
 def fail_from(monkeypatch, step):

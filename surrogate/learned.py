@@ -1,0 +1,249 @@
+"""Learned maps behind the seam `biem.membrane.maps.MembraneMaps`: standardize -> network -> undo, batched over vesicles and modes.
+
+A network knows curves of length 1 in the standard pose, in the units mu = kappa_b = 1; `Pose` says how its answers scale. A residual
+network corrects `ExactMaps` built at few nodes. Relaxation knows the time steps that it was trained for; of the converged flow any sum of
+them is composed, and what remains of a step is left to exact maps, and counted.
+
+The relaxation network's modes |k| >= DAMPED_FROM N/32 are not taken from a full network: with errors of a few percent of each they would
+grow from step to step. They decay as they do on a circle: by exp(-dt (2 pi k)^3/4), or 1/(1 + dt (2 pi k)^3/4) in an implicit step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from math import pi
+
+import numpy as np
+import torch
+from array_api_compat import array_namespace
+from torch import Tensor
+
+from biem.backend import Array, Latest, count, from_numpy, on_cpu, parallel_map, shares, to_numpy
+from biem.curves.curve import length, speed
+from biem.curves.pose import Pose, standardize
+from biem.errors import NumericalFailure
+from biem.membrane.maps import ExactMaps
+from surrogate.features import frame
+from surrogate.networks import LearnedMap
+from surrogate.targets import apply_kernel, apply_modes, from_frame
+from surrogate.weights import Card
+
+DAMPED_FROM = 11  # of N = 32
+CPU_CHUNK, DEVICE_CHUNK = 128, 4096  # vesicles at a time: their operators stay in the cache, in the memory
+SAME_DT = 1e-2  # relative difference of time steps that counts as none: lengths of membranes vary by less than a third of it
+LIMITS = ("flag", "exact", "refuse")
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A network and what it is of. base: the exact maps that a residual network corrects."""
+
+    network: LearnedMap
+    card: Card
+    base: ExactMaps | None = None
+
+
+@dataclass(frozen=True)
+class Standard:
+    """Curves in the standard pose: X (M, 2, N) float64 and their frames, as tensors; distances from the training shapes (M,)."""
+
+    X: Tensor
+    frames: Tensor
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class LearnedMaps:
+    """`MembraneMaps` of networks. loaded: by slot; relax: several, by time step. exact: for what the networks do not know.
+
+    limits: what to do with vesicles outside the training distribution: "flag" them in the diagnostics, answer by "exact" maps, or "refuse".
+    A map whose slot is not loaded, other than near, raises KeyError.
+    """
+
+    loaded: Mapping[str, tuple[Loaded, ...]]
+    kappa_b: float = 1.0
+    mu: float = 1.0
+    exact: ExactMaps = field(default_factory=ExactMaps)
+    limits: str = "flag"
+    _standard: Latest = field(default_factory=Latest, init=False, repr=False, compare=False)
+    _outside: Latest = field(default_factory=Latest, init=False, repr=False, compare=False)
+    _operator: dict[str, Latest] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def advect(self, X: Array, u: Array) -> Array:
+        """(1 - M) u (M, 2, N)."""
+
+        def learned(X: Array, u: Array) -> Array:
+            v, pose = self._applied("advection", X, u)
+            return _plus(pose.vectors_back(v[:, 0]), self._base("advection"), lambda base: base.advect(X, u))
+
+        return self._limited(learned, self.exact.advect, X, u)
+
+    def flow_tension(self, X: Array, u: Array) -> Array:
+        """L^-1 P u (M, N)."""
+
+        def learned(X: Array, u: Array) -> Array:
+            v, pose = self._applied("flow_tension", X, u)
+            return _plus(self.mu * pose.scalars_back(v[:, 0, 0]), self._base("flow_tension"), lambda base: base.flow_tension(X, u))
+
+        return self._limited(learned, self.exact.flow_tension, X, u)
+
+    def near_layers(self, X: Array, f: Array) -> Array:
+        """S[X, f] on the layers (M, n_layers, 2, N); by exact maps where there is no network, as for "hybrid"."""
+        if "near" not in self.loaded:
+            return self.exact.near_layers(X, f)
+
+        def learned(X: Array, f: Array) -> Array:
+            v, pose = self._applied("near", X, f)
+            xp = array_namespace(X)
+            N = X.shape[-1]
+            total = xp.sum(f * speed(X)[:, None, :], axis=-1) * (2.0 * pi / N)  # int f ds
+            constant = -total * (xp.log(pose.scale) / (4.0 * pi * self.mu))[:, None]
+            return pose.vectors_back(v) * (pose.scale / self.mu)[:, None, None, None] + constant[:, None, :, None]
+
+        return self._limited(learned, self.exact.near_layers, X, f)
+
+    def self_tension(self, X: Array) -> Array:
+        """L^-1 P B X (M, N)."""
+
+        def learned(X: Array) -> Array:
+            part = self._part("self_tension")
+            standard = self._standardized(X)
+            sigma = _back(part.network(standard.X)[:, 0, 0], X)
+            back = standard.pose.scalars_back(sigma) * (self.kappa_b / standard.pose.scale**2)[:, None]
+            return _plus(back, part.base, lambda base: base.self_tension(X))
+
+        return self._limited(learned, self.exact.self_tension, X)
+
+    def relax(self, X: Array, dt: float) -> Array:
+        """X_next (M, 2, N) after dt: the steps that networks know, and the rest by exact maps."""
+        scaled = dt * self.kappa_b / (self.mu * float(array_namespace(X).mean(length(X))) ** 3)
+        steps, rest = composition(scaled, [part.card.dt or 0.0 for part in self.loaded["relax"]])
+        for part, times in zip(self.loaded["relax"], steps, strict=True):
+            each = dt * (part.card.dt or 0.0) / scaled
+            learned = partial(self._relaxed, part=part, dt=each)
+            for _ in range(times):
+                X = self._limited(learned, partial(self.exact.relax, dt=each), X)
+        if rest > 0.0:
+            count("relaxation_rest_by_exact_maps", X.shape[0])
+            X = self.exact.relax(X, dt * rest / scaled)
+        return X
+
+    def diagnostics(self, X: Array) -> Mapping[str, float]:
+        """Vesicles outside the training distribution, and those of them that exact maps answer for."""
+        outside = float(np.sum(self._is_outside(X)))
+        return {"out_of_distribution": outside, "by_exact_maps": outside if self.limits == "exact" else 0.0}
+
+    def _relaxed(self, X: Array, part: Loaded, dt: float) -> Array:
+        standard = self._standardized(X)
+        increments = from_frame(part.network(standard.X)[:, 0].double(), standard.frames)
+        if part.base is not None:
+            scale = standard.pose.scale[:, None, None]
+            return part.base.relax(X, dt) + standard.pose.vectors_back(_back(increments, X)) * scale
+        X_next = standard.X + damped(increments, standard.X, part.card.dt or 0.0, part.card.relaxation == "converged")
+        return standard.pose.points_back(_back(X_next, X))
+
+    def _applied(self, slot: str, X: Array, u: Array) -> tuple[Array, Pose]:
+        """The network's answer (M, S, C, N) to u, in the standard frame, and the pose."""
+        standard = self._standardized(X)
+        part = self._part(slot)
+        u_std = _tensor(standard.pose.vectors(u))
+        operators = self._operator.setdefault(slot, Latest()).of(X, lambda: _chunked(lambda c: part.network(standard.X[c]), standard.X))
+
+        def at(chunk: slice) -> Tensor:
+            frames = standard.frames[chunk]
+            A = operators[chunk]
+            of_modes = part.card.network.arch == "ivnet"
+            v = apply_modes(A, u_std[chunk]) if of_modes else apply_kernel(A[:, 0], u_std[chunk], frames)
+            return from_frame(v.double(), frames) if v.shape[2] == 2 else v.double()
+
+        return _back(_chunked(at, standard.X), X), standard.pose
+
+    def _standardized(self, X: Array) -> Standard:
+        def make() -> Standard:
+            X_std, pose = standardize(X)
+            tensor = _tensor(X_std)
+            for parts in self.loaded.values():
+                for part in parts:
+                    if part.network.distribution.center.device != tensor.device:
+                        part.network.to(tensor.device)
+            return Standard(tensor, frame(tensor), pose)
+
+        return self._standard.of(X, make)
+
+    def _part(self, slot: str) -> Loaded:
+        return self.loaded[slot][0]
+
+    def _base(self, slot: str) -> ExactMaps | None:
+        return self._part(slot).base
+
+    def _is_outside(self, X: Array) -> np.ndarray:
+        """(M,) bool, by the statistics of the first map loaded."""
+
+        def make() -> np.ndarray:
+            distribution = next(iter(self.loaded.values()))[0].network.distribution
+            X_std = self._standardized(X).X
+            outside = (distribution(X_std) > distribution.limit).cpu().numpy()
+            if self.limits == "refuse" and outside.any():
+                raise NumericalFailure(
+                    f"vesicle {np.flatnonzero(outside)[0]} (and {outside.sum() - 1} more) is unlike the shapes of the networks' training: "
+                    'solver.out_of_distribution = "exact" answers by exact maps, "flag" goes on'
+                )
+            return outside
+
+        return self._outside.of(X, make)
+
+    def _limited(self, learned: Callable[..., Array], exact: Callable[..., Array], X: Array, *fields: Array) -> Array:
+        """learned(X, *fields), where the limits ask for it by exact(X, *fields) for vesicles outside the distribution."""
+        if self.limits == "flag":
+            return learned(X, *fields)
+        outside = self._is_outside(X)
+        if not outside.any():
+            return learned(X, *fields)
+        count("by_exact_maps", int(outside.sum()))
+        xp = array_namespace(X)
+        which = from_numpy(np.flatnonzero(outside), X)
+        out = xp.asarray(learned(X, *fields), copy=True)
+        out[which] = exact(X[which], *(f[which] for f in fields))
+        return out
+
+
+def composition(dt: float, known: list[float]) -> tuple[list[int], float]:
+    """How often each known step is to be taken, the longest first, and what remains of dt: 0 where less than SAME_DT of it does."""
+    times, rest = [0] * len(known), dt
+    for i in sorted(range(len(known)), key=lambda i: -known[i]):
+        times[i] = max(0, int((rest + SAME_DT * known[i]) / known[i]))
+        rest -= times[i] * known[i]
+    return times, rest if rest > SAME_DT * dt else 0.0
+
+
+def damped(increments: Tensor, X: Tensor, dt: float, converged: bool) -> Tensor:
+    """increments (M, 2, N) of X in the standard pose, their modes |k| >= DAMPED_FROM N/32 as they relax on a circle."""
+    N = X.shape[-1]
+    k = torch.arange(N // 2 + 1, dtype=torch.float64, device=X.device)
+    rate = 0.25 * dt * (2.0 * pi * k) ** 3
+    decay = torch.exp(-rate) - 1.0 if converged else 1.0 / (1.0 + rate) - 1.0
+    high = k >= DAMPED_FROM * N / 32
+    return torch.fft.irfft(torch.where(high, decay * torch.fft.rfft(X), torch.fft.rfft(increments)), n=N)
+
+
+def _chunked(function: Callable[[slice], Tensor], like: Tensor) -> Tensor:
+    """function of slices of the vesicles, on threads, joined."""
+    M = like.shape[0]
+    chunks = shares(0, M, 16, CPU_CHUNK) if on_cpu(like) else [slice(i, i + DEVICE_CHUNK) for i in range(0, M, DEVICE_CHUNK)]
+    parts = parallel_map(function, chunks) if on_cpu(like) else [function(chunk) for chunk in chunks]
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _tensor(a: Array) -> Tensor:
+    return a if isinstance(a, Tensor) else torch.from_numpy(np.ascontiguousarray(a))
+
+
+def _back(a: Tensor, like: Array) -> Array:
+    """As an array of the kind and dtype of `like`."""
+    return a.to(like.dtype) if isinstance(like, Tensor) else to_numpy(a).astype(like.dtype, copy=False)
+
+
+def _plus(values: Array, base: ExactMaps | None, exact: Callable[[ExactMaps], Array]) -> Array:
+    return values if base is None else values + exact(base)
