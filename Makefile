@@ -1,4 +1,4 @@
-# make demo: set up everything, run two vesicles in shear and 100 in a parabolic flow, make a small data set; leave it all in out/demo.
+# make demo: set up everything, run two vesicles in shear, by every solver, and 100 in a parabolic flow, make a small data set: in out/demo.
 # make dataset: harvest and select the shapes of configs/datagen/default.toml into data/default, or go on with that.
 # make test: set up everything, run the tests, on as many processes as there are cores.
 PYTHON ?= python3
@@ -21,6 +21,7 @@ demo: $(READY)
 	$(BIN)/python -m biem plot out/demo/shear_pair.h5 -o out/demo/shear_pair
 	$(BIN)/python -m biem run configs/scenes/poiseuille_100.toml -o out/demo/poiseuille_100.h5 --force
 	$(BIN)/python -m biem plot out/demo/poiseuille_100.h5 -o out/demo/poiseuille_100
+	OMP_NUM_THREADS=1 $(BIN)/python scripts/ladder.py configs/scenes/vesnet_pair.toml -o out/demo/ladder --set "time.horizon=10 t_gamma"
 	$(BIN)/python -m datagen make configs/datagen/smoke.toml -o out/demo/data
 
 dataset: $(READY)

@@ -3,10 +3,12 @@
 python scripts/bench_step.py                                                      # the split solver on this machine's cores
 python scripts/bench_step.py --solvers implicit split --counts 48 504
 python scripts/bench_step.py --devices cuda --dtypes float64 float32 --far-fields auto direct
+python scripts/bench_step.py --solvers split vesnet:hybrid vesnet:mlp vesnet:ivnet --dtypes float32 --counts 504
 python scripts/bench_step.py --smoke                                              # small cases, seconds
 
 Vesicles of reduced area 0.65 fill 30 % of the area: tiles of one random packing, in Poiseuille flow (Ca = 2, W = 40 R), dt = 0.005 t_gamma.
-Wall seconds are the median of a few steps after two steps of warm-up; the stages are those of that step, the guard is not in it.
+VesNet takes dt = 1e-5 mu length^3/kappa_b, which its networks are for. Wall seconds are the median of a few steps after two steps of
+warm-up; the stages are those of that step, the guard is not in it.
 """
 
 from __future__ import annotations
@@ -37,6 +39,8 @@ from biem.steppers.stepper import State
 
 TILE = 504  # vesicles of one packing
 FRACTION = 0.3
+LEARNED_DT = 1e-5  # mu length^3 / kappa_b: relaxation networks know no other
+SOLVERS = ("split", "implicit", "vesnet:exact", "vesnet:hybrid", "vesnet:mlp", "vesnet:ivnet")
 STAGES = (
     "near",
     "far",
@@ -71,12 +75,15 @@ def bench(case: dict) -> dict:
     R = float(effective_radius(X[:1])[0])
     rate = 2.0 / (2.0 * R**3)
     flow = make_flow("poiseuille", rate, 40.0 * R)
-    solver = {"kind": case["solver"], "near_tolerance": case["tolerance"], "far_field": case["far_field"]}
-    if case["solver"] == "split":
+    kind, _, maps = case["solver"].partition(":")
+    solver = {"kind": kind, "near_tolerance": case["tolerance"], "far_field": case["far_field"]}
+    if kind != "implicit":
         solver |= {"device": case["device"], "dtype": case["dtype"], "far_tolerance": case["tolerance"]}
+    if kind == "vesnet":
+        solver |= {"maps": maps, "weights": case["weights"]}
     if case["operator_points"]:
         solver["operator_points"] = case["operator_points"]
-    dt = 0.005 / rate
+    dt = LEARNED_DT if kind == "vesnet" else 0.005 / rate
     scene = make_scene({"name": "bench", "time": {"dt": dt, "horizon": 1.0}, "flow": {"kind": "poiseuille"}, "solver": solver})
     problem = Problem(scene, X, flow, dt, dt / 1000.0, 1.0, R**3)
     stepper = make_stepper(problem, area(X), length(X))
@@ -154,7 +161,8 @@ def row(r: dict) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--solvers", nargs="+", default=["split"], choices=["split", "implicit"])
+    parser.add_argument("--solvers", nargs="+", default=["split"], choices=SOLVERS)
+    parser.add_argument("--weights", type=Path, default=None, help="vesnet: a folder of weights; default those that are shipped")
     parser.add_argument("--counts", nargs="+", type=int, default=[48, 200, 504, 1020, 2000, 8000])
     parser.add_argument("--points", nargs="+", type=int, default=[32])
     parser.add_argument("--operator-points", type=int, default=None)
@@ -177,13 +185,14 @@ def main() -> None:
     print("| solver | device | far field | N | M | median s | best s | " + " | ".join(STAGES) + " | peak GB |")
     print("|" + "---|" * (8 + len(STAGES)))
     for solver in options.solvers:
-        for device in options.devices if solver == "split" else ["cpu"]:
-            for dtype in options.dtypes if solver == "split" else ["float64"]:
+        for device in options.devices if solver != "implicit" else ["cpu"]:
+            for dtype in options.dtypes if solver != "implicit" else ["float64"]:
                 for far_field in options.far_fields:
                     for N in options.points:
                         for M in options.counts:
                             case = {"solver": solver, "device": device, "dtype": dtype, "far_field": far_field, "N": N, "M": M}
                             case |= {"tolerance": options.tolerance, "operator_points": options.operator_points, "repeat": options.repeat}
+                            case["weights"] = str(options.weights.resolve()) if options.weights else None
                             command = [sys.executable, __file__, "--case", json.dumps(case)]
                             try:
                                 done = subprocess.run(command, capture_output=True, text=True, timeout=options.limit, check=True)

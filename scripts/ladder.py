@@ -25,10 +25,12 @@ from biem.scene.config import Scene, load_scene
 RUNGS = ("implicit", "split", "hybrid", "mlp", "ivnet")
 
 
-def scene_of(path: Path, rung: str, overrides: list[str], points: int | None) -> Scene:
+def scene_of(path: Path, rung: str, overrides: list[str], points: int | None, weights: Path | None) -> Scene:
     """The scene by one rung."""
     exact = rung in ("implicit", "split")
     chosen = [f'solver.kind="{rung}"'] if exact else ['solver.kind="vesnet"', f'solver.maps="{rung}"']
+    if weights and not exact:
+        chosen.append(f'solver.weights="{weights.resolve()}"')
     unused = ['solver.maps="hybrid"', 'solver.out_of_distribution="flag"'] if exact else []
     return load_scene(path, [*overrides, *unused, *chosen, *([f"vesicles.points={points}"] if points else [])])
 
@@ -74,12 +76,13 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/ladder"))
     parser.add_argument("--rungs", nargs="+", choices=RUNGS, default=list(RUNGS))
     parser.add_argument("--reference-points", type=int, default=64, help="nodes of the first rung")
+    parser.add_argument("--weights", type=Path, help="folder of weights; default those that are shipped")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
     chosen = parser.parse_args()
     chosen.output.mkdir(parents=True, exist_ok=True)
     trajectories = {}
     for index, rung in enumerate(chosen.rungs):
-        scene = scene_of(chosen.scene, rung, chosen.set, chosen.reference_points if index == 0 else None)
+        scene = scene_of(chosen.scene, rung, chosen.set, chosen.reference_points if index == 0 else None, chosen.weights)
         trajectories[rung] = run(scene, chosen.output / f"{rung}.h5")
     first = trajectories[chosen.rungs[0]]
     R = float(np.sqrt(area(first.X[0]).mean() / np.pi))

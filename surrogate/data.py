@@ -155,7 +155,7 @@ def mode_data(source: Source, rows: np.ndarray, images: int, floors: Floors | No
 
 @dataclass(frozen=True)
 class Basis:
-    """Of the parts of flat outputs: mean (Q,) of the even one, vectors (rank, Q), `ranks` of each; floors: least norms of outputs and slopes."""
+    """Of the parts of outputs: mean (Q,) of the even one, vectors (rank, Q), `ranks` of each; floors: least norms of outputs and slopes."""
 
     parts: Parts
     mean: Tensor

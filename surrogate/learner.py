@@ -8,18 +8,20 @@ An IVNet's errors are nodal values; an MLP's are coefficients in an orthonormal 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from surrogate.config import TrainingTable
-from surrogate.data import BasisData, Floors, ModeData, Source, basis_data, mode_data, principal_components
+from surrogate.data import Basis, BasisData, Floors, ModeData, Source, basis_data, mode_data, principal_components
 from surrogate.features import derivative
 from surrogate.networks import IVNetMap, LearnedMap, MLPMap, Settings, make_network
+from surrogate.symmetric import Parts
 from surrogate.targets import SYMMETRIES
 
 VALIDATED = 2000  # shapes of a validation, at most
@@ -46,12 +48,14 @@ class Learner(ABC):
     inputs: Tensor
     slope: Tensor  # takes an error to what has the norm of its derivative
 
-    def __init__(self, source: Source, training: TrainingTable, rank: int, device: str) -> None:
+    def __init__(self, source: Source, training: TrainingTable, rank: int, device: str, kept: Mapping[str, Any] | None) -> None:
         self.source, self.training, self.rank, self.device = source, training, rank, device
         self._kept: tuple[tuple[str, int | None] | None, ModeData | BasisData | None] = (None, None)
+        for split in ("val", "test"):
+            source.rows(split, None)  # that there are none shows here, not after the training
         self.rows = source.rows("train", training.shapes, training.seed)
         self.images = len(SYMMETRIES) if training.augment else 1
-        self._fill()
+        self._fill(kept or {})
         self.network.distribution.measure(source.shapes(self.rows))
         self.network.to(device)
         if training.compile:
@@ -60,8 +64,12 @@ class Learner(ABC):
         self.average = {name: value.detach().clone() for name, value in self.network.core.state_dict().items()}
 
     @abstractmethod
-    def _fill(self) -> None:
-        """Makes the data and the network."""
+    def _fill(self, kept: Mapping[str, Any]) -> None:
+        """Makes the data and the network. kept: what `keep` gave for a checkpoint."""
+
+    def keep(self) -> dict[str, Any]:
+        """What a training that goes on must find as it was, and would not make the same bits of on another machine."""
+        return {}
 
     @abstractmethod
     def _differences(self, data: ModeData | BasisData, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -165,7 +173,7 @@ class ModeLearner(Learner):
     def _data(self) -> ModeData:
         return self.data
 
-    def _fill(self) -> None:
+    def _fill(self, kept: Mapping[str, Any]) -> None:
         data, self.floors = mode_data(self.source, self.rows, self.images)
         network = self._drawn(self.source.settings)
         assert isinstance(network, IVNetMap)
@@ -199,8 +207,12 @@ class BasisLearner(Learner):
     def _data(self) -> BasisData:
         return self.data
 
-    def _fill(self) -> None:
-        self.basis = principal_components(self.source, self.rows, self.rank, self.training.seed)
+    def _fill(self, kept: Mapping[str, Any]) -> None:
+        if kept:
+            parts = Parts(self.source.settings.map, self.source.settings.output_shape)
+            self.basis = Basis(parts, kept["mean"], kept["vectors"], tuple(kept["ranks"]), (kept["floors"][0], kept["floors"][1]))
+        else:
+            self.basis = principal_components(self.source, self.rows, self.rank, self.training.seed)
         data = basis_data(self.source, self.rows, self.images, self.basis)
         network = self._drawn(replace(self.source.settings, ranks=self.basis.ranks))
         assert isinstance(network, MLPMap)
@@ -220,6 +232,10 @@ class BasisLearner(Learner):
         values, vectors = torch.linalg.eigh(slopes @ slopes.T)
         self.slope = (vectors * values.clamp(min=0.0).sqrt()).float()
 
+    def keep(self) -> dict[str, Any]:
+        b = self.basis
+        return {"mean": b.mean, "vectors": b.vectors, "ranks": list(b.ranks), "floors": list(b.floors)}
+
     def _held_out(self, split: str, most: int | None) -> BasisData:
         return basis_data(self.source, self.source.rows(split, most, self.training.seed), 1, self.basis).to(self.device)
 
@@ -228,6 +244,6 @@ class BasisLearner(Learner):
         return (y - data.outputs[rows])[None], data.norms[None, rows], data.slopes[None, rows]
 
 
-def make_learner(source: Source, training: TrainingTable, rank: int, device: str) -> Learner:
-    """Of the kind that the network asks for. Raises ValueError for data that have not what it needs."""
-    return (ModeLearner if source.settings.arch == "ivnet" else BasisLearner)(source, training, rank, device)
+def make_learner(source: Source, training: TrainingTable, rank: int, device: str, kept: Mapping[str, Any] | None = None) -> Learner:
+    """Of the kind that the network asks for. kept: of a checkpoint. Raises ValueError for data that have not what it needs."""
+    return (ModeLearner if source.settings.arch == "ivnet" else BasisLearner)(source, training, rank, device, kept)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import torch
+
 from biem.backend import Array
 from biem.membrane.maps import ExactMaps, MapsRequest, MembraneMaps
 from surrogate.learned import LearnedMaps
@@ -36,11 +38,13 @@ class SlotMaps:
         """The largest of each number over the makers."""
         makers = {id(maps): maps for maps in self.slots.values() if isinstance(maps, LearnedMaps)}
         found = [maps.diagnostics(X) for maps in makers.values()]
-        return {name: max(d[name] for d in found) for name in found[0]}
+        return {name: max(d[name] for d in found) for name in found[0]} if found else {}
 
 
 def make_maps(request: MapsRequest) -> SlotMaps:
     """Maps for a scene, only those that it needs from files. Raises ValueError, FileNotFoundError for weights that do not fit."""
+    if request.device == "cpu":
+        torch.set_num_threads(1)  # vesicles are dealt out to threads in chunks: more threads within an operation only wait for each other
     exact = ExactMaps(request.kappa_b, request.mu, request.operator_points, request.dtype)
     slots: dict[str, MembraneMaps] = dict.fromkeys(request.kinds, exact)
     learned = {slot: kind for slot, kind in request.kinds.items() if slot in request.needed and kind != "exact"}

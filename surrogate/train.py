@@ -108,7 +108,9 @@ class _Run:
         if residual and job.map == "near":
             raise ValueError('network.target = "residual" is not for near: its exact maps are direct quadrature already')
         self.source = Source(pairs, settings, config.network.base_points if residual else None)
-        self.learner = make_learner(self.source, self.training, config.network.rank, device)
+        path = folder / "checkpoint.pt"
+        self.found = read_checkpoint(path) if path.exists() else None
+        self.learner = make_learner(self.source, self.training, config.network.rank, device, self.found and self.found["kept"])
         t = self.training
         self.core = self.learner.network.core
         self.optimizer = torch.optim.AdamW(self.core.parameters(), lr=t.lr, weight_decay=t.weight_decay)
@@ -174,6 +176,7 @@ class _Run:
         content = {
             "step": self.step,
             "seconds": self.seconds,
+            "kept": self.learner.keep(),
             "core": self.core.state_dict(),
             "average": self.learner.average,
             "optimizer": self.optimizer.state_dict(),
@@ -187,11 +190,10 @@ class _Run:
 
     def load(self) -> None:
         """Goes on from the checkpoint, if there is one."""
-        path = self.folder / "checkpoint.pt"
-        if not path.exists():
+        found = self.found
+        if found is None:
             (self.folder / "log.jsonl").unlink(missing_ok=True)
             return
-        found = read_checkpoint(path)
         self.core.load_state_dict(found["core"])
         self.learner.average = {name: value.to(self.device) for name, value in found["average"].items()}
         self.optimizer.load_state_dict(found["optimizer"])
