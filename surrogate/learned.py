@@ -3,9 +3,6 @@
 A network knows curves of length 1 in the standard pose, in the units mu = kappa_b = 1; `Pose` says how its answers scale. A residual
 network corrects `ExactMaps` built at few nodes. Relaxation knows the time steps that it was trained for; of the converged flow any sum of
 them is composed, and what remains of a step is left to exact maps, and counted.
-
-The relaxation network's modes |k| >= DAMPED_FROM N/32 are not taken from a full network: with errors of a few percent of each they would
-grow from step to step. They decay as they do on a circle: by exp(-dt (2 pi k)^3/4), or 1/(1 + dt (2 pi k)^3/4) in an implicit step.
 """
 
 from __future__ import annotations
@@ -25,12 +22,12 @@ from biem.curves.curve import length, speed
 from biem.curves.pose import Pose, standardize
 from biem.errors import NumericalFailure
 from biem.membrane.maps import ExactMaps
+from surrogate.damping import damped
 from surrogate.features import frame
 from surrogate.networks import LearnedMap
 from surrogate.targets import apply_kernel, apply_modes, from_frame
 from surrogate.weights import Card
 
-DAMPED_FROM = 11  # of N = 32
 CPU_CHUNK, DEVICE_CHUNK = 128, 4096  # vesicles at a time: their operators stay in the cache, in the memory
 SAME_DT = 1e-2  # relative difference of time steps that counts as none: lengths of membranes vary by less than a third of it
 LIMITS = ("flag", "exact", "refuse")
@@ -141,8 +138,9 @@ class LearnedMaps:
         if part.base is not None:
             scale = standard.pose.scale[:, None, None]
             return part.base.relax(X, dt) + standard.pose.vectors_back(_back(increments, X)) * scale
-        X_next = standard.X + damped(increments, standard.X, part.card.dt or 0.0, part.card.relaxation == "converged")
-        return standard.pose.points_back(_back(X_next, X))
+        if part.card.damped_from is not None:
+            increments = damped(increments, standard.X, part.card)
+        return standard.pose.points_back(_back(standard.X + increments, X))
 
     def _applied(self, slot: str, X: Array, u: Array) -> tuple[Array, Pose]:
         """The network's answer (M, S, C, N) to u, in the standard frame, and the pose."""
@@ -216,16 +214,6 @@ def composition(dt: float, known: list[float]) -> tuple[list[int], float]:
         times[i] = max(0, int((rest + SAME_DT * known[i]) / known[i]))
         rest -= times[i] * known[i]
     return times, rest if rest > SAME_DT * dt else 0.0
-
-
-def damped(increments: Tensor, X: Tensor, dt: float, converged: bool) -> Tensor:
-    """increments (M, 2, N) of X in the standard pose, their modes |k| >= DAMPED_FROM N/32 as they relax on a circle."""
-    N = X.shape[-1]
-    k = torch.arange(N // 2 + 1, dtype=torch.float64, device=X.device)
-    rate = 0.25 * dt * (2.0 * pi * k) ** 3
-    decay = torch.exp(-rate) - 1.0 if converged else 1.0 / (1.0 + rate) - 1.0
-    high = k >= DAMPED_FROM * N / 32
-    return torch.fft.irfft(torch.where(high, decay * torch.fft.rfft(X), torch.fft.rfft(increments)), n=N)
 
 
 def _chunked(function: Callable[[slice], Tensor], like: Tensor) -> Tensor:

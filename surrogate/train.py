@@ -23,14 +23,17 @@ from biem.run.files import write_atomically
 from biem.run.simulate import Stopped, commit, stop_signals
 from biem.scene.tables import flat
 from surrogate.config import Training
+from surrogate.damping import Relax, least_damping
 from surrogate.data import Source
+from surrogate.learned import LearnedMaps, Loaded
 from surrogate.learner import VALIDATED, Errors, make_learner
-from surrogate.networks import Settings
+from surrogate.networks import LearnedMap, Settings
 from surrogate.pairs import Pairs
 from surrogate.targets import TARGETS
 from surrogate.weights import Card, checkpoint_bytes, read_checkpoint, save_weights
 
 WARM_UP = 100  # steps
+STABLE_SHAPES = 96  # that a relaxation network is tried on, in steps one after another
 
 
 @dataclass(frozen=True)
@@ -226,8 +229,18 @@ class _Run:
             commit=commit(),
             errors={str(k): Errors(test[i : i + 1]).summary() for i, k in enumerate(network.settings.modes or ("all",))},
         )
+        if name == "relax" and card.target == "full":
+            card = card.model_copy(update={"damped_from": self._least_damping(network, card)})
         save_weights(path, network, card)
         draw_curve(self.folder)
+
+    def _least_damping(self, network: LearnedMap, card: Card) -> int | None:
+        def relax(choice: int | None) -> Relax:
+            part = Loaded(network.requires_grad_(False), card.model_copy(update={"damped_from": choice}))
+            return LearnedMaps({"relax": (part,)}).relax
+
+        X = self.source.shapes(self.source.rows("val", STABLE_SHAPES, self.training.seed)).numpy()
+        return least_damping(relax, X, self.pairs.dt)
 
 
 def read_log(folder: Path) -> list[dict[str, Any]]:

@@ -31,7 +31,8 @@ class Card(Table):
     """What a file of weights is of, and how good it is.
 
     settings: of the network. target: "full", or "residual" against exact maps at base_points nodes. dt: of relax, in mu length^3/kappa_b;
-    relaxation: "implicit" step or "converged" flow over it. layers: offsets of near layers, in arclength spacings. operator_points: of the
+    relaxation: "implicit" step or "converged" flow over it; damped_from: mode from which its increments are not taken from the network
+    (`surrogate.damping`), or None. layers: offsets of near layers, in arclength spacings. operator_points: of the
     labels. data: SHA-256 of the data set's manifest. errors: by mode ("all" where one network has them all), relative L2 on test runs.
     """
 
@@ -42,6 +43,7 @@ class Card(Table):
     reduced_area: float
     dt: float | None
     relaxation: str | None
+    damped_from: int | None = None
     layers: list[float] | None
     operator_points: int
     data: str

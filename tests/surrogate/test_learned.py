@@ -11,7 +11,8 @@ from biem.backend import counting, to_numpy
 from biem.curves.curve import length
 from biem.errors import NumericalFailure
 from biem.membrane.maps import SLOTS, ExactMaps
-from surrogate.learned import LearnedMaps, Loaded, composition, damped
+from surrogate.damping import damped, least_damping
+from surrogate.learned import LearnedMaps, Loaded, composition
 
 DT = 1e-5
 KAPPA_B, MU, LENGTH = 0.7, 2.3, 2.5
@@ -19,10 +20,10 @@ ROUNDING = 1e-9
 CASES = [(slot, arch) for slot in SLOTS for arch in ("ivnet", "mlp")]
 
 
-def loaded(slot, arch="mlp", points=64, base=None, dt=DT, relaxation="implicit", units=(1.0, 1.0), network=None):
+def loaded(slot, arch="mlp", points=64, base=None, dt=DT, relaxation="implicit", units=(1.0, 1.0), network=None, damped_from=None):
     """One that knows the maps built at `points` nodes; base: nodes of exact maps that it corrects."""
     settings = settings_for(slot, arch)
-    changes = {"dt": dt, "relaxation": relaxation} if slot == "relax" else {}
+    changes = {"dt": dt, "relaxation": relaxation, "damped_from": damped_from} if slot == "relax" else {}
     card = card_of(settings, target="full" if base is None else "residual", **changes)
     network = network or Exactly(settings, points, dt, base)
     return Loaded(network, card, None if base is None else ExactMaps(*units, points=base))
@@ -39,9 +40,9 @@ def answer(maps, slot, X, u, dt=DT):
 
 
 def low(X):
-    """The modes that relaxation networks are asked for, |k| < 11."""
+    """Without the Nyquist mode, which has no standard pose."""
     X_hat = np.fft.rfft(X)
-    X_hat[..., 11:] = 0
+    X_hat[..., -1] = 0
     return np.fft.irfft(X_hat)
 
 
@@ -105,7 +106,9 @@ def test_a_residual_and_its_base_are_the_exact_maps(slot, arch):
 @pytest.mark.parametrize("relaxation", ["implicit", "converged"])
 def test_high_modes_of_a_full_network_relax_as_on_a_circle(relaxation):
     X, _ = world()
-    X_next = LearnedMaps({"relax": (loaded("relax", relaxation=relaxation),)}, KAPPA_B, MU).relax(X, DT * MU * LENGTH**3 / KAPPA_B)
+    X_next = LearnedMaps({"relax": (loaded("relax", relaxation=relaxation, damped_from=11),)}, KAPPA_B, MU).relax(
+        X, DT * MU * LENGTH**3 / KAPPA_B
+    )
     rate = DT * (2 * np.pi * np.arange(N // 2 + 1)) ** 3 / 4
     factor = np.exp(-rate) if relaxation == "converged" else 1 / (1 + rate)
     got, X_hat = np.fft.rfft(X_next)[..., 11:16], np.fft.rfft(X)[..., 11:16]
@@ -118,11 +121,29 @@ def test_damping_leaves_low_modes_alone():
     for n, first in ((32, 11), (64, 22)):
         X, Z = (torch.randn((2, 2, n), generator=generator, dtype=torch.float64) for _ in range(2))
         for converged in (True, False):
-            out = torch.fft.rfft(damped(Z, X, 1e-4, converged))
+            relaxation = "converged" if converged else "implicit"
+            card = card_of(settings_for("relax"), dt=1e-4, relaxation=relaxation, damped_from=first)
+            out = torch.fft.rfft(damped(Z, X, card))
             assert (out - torch.fft.rfft(Z))[..., :first].abs().max() < 1e-13
             rate = 0.25e-4 * (2 * np.pi * torch.arange(first, n // 2 + 1, dtype=torch.float64)) ** 3
             change = torch.exp(-rate) - 1 if converged else -rate / (1 + rate)
             assert (out[..., first:] - change * torch.fft.rfft(X)[..., first:]).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize(("stable_from", "choice"), [(99, None), (14, 13), (0, 11)])
+def test_as_much_damping_as_stability_takes_and_no_more(stable_from, choice):
+    """A relaxation that makes its undamped modes from `stable_from` on grow a little, step by step."""
+
+    def relax(damped_from):
+        def step(X, dt):
+            z = np.fft.rfft(X)
+            high = slice(min(stable_from, 16), min(damped_from or 16, 16))
+            z[..., high] = 1.5 * z[..., high] + 1e-4
+            return np.fft.irfft(z, n=X.shape[-1])
+
+        return step
+
+    assert least_damping(relax, mild(3), 1e-5) == choice
 
 
 # --- steps
