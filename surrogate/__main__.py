@@ -15,7 +15,7 @@ from biem.cli import fail, first_rank_only, one_line_errors
 from biem.ranks import Ranks, world
 from biem.run.solver import check_device
 from surrogate.config import Training, load_training
-from surrogate.evaluate import PARTS, Options, evaluate
+from surrogate.evaluation import PARTS, Options, evaluate
 from surrogate.grid import grid_table, variants
 from surrogate.jobs import Work, cost, dealt, pick, pick_all, read_part
 from surrogate.library import KINDS

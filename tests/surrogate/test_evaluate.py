@@ -15,15 +15,15 @@ from biem.curves.fourier import resample
 from biem.membrane.maps import ExactMaps
 from datagen.config import Label
 from datagen.shapes import encode
-from surrogate import evaluate as module
-from surrogate.evaluate import Options, evaluate
-from surrogate.evaluate_cost import ORDER, costs
-from surrogate.evaluate_errors import map_errors, test_rows
-from surrogate.evaluate_parts import Parts, resolved_shapes
-from surrogate.evaluate_relaxation import DIVERGED, errors_of_steps, march, reference
-from surrogate.evaluate_rungs import Rung, SteppedMaps, exact_rungs, learned_rungs, operators, stats
-from surrogate.evaluate_tables import trade
-from surrogate.evaluate_velocities import neighbours, velocity_errors
+from surrogate.evaluation import Options, evaluate
+from surrogate.evaluation import run as module
+from surrogate.evaluation.cost import ORDER, costs
+from surrogate.evaluation.errors import map_errors, test_rows
+from surrogate.evaluation.parts import Parts, resolved_shapes
+from surrogate.evaluation.relaxation import DIVERGED, errors_of_steps, march, reference
+from surrogate.evaluation.rungs import Rung, SteppedMaps, exact_rungs, learned_rungs, operators, stats
+from surrogate.evaluation.tables import trade
+from surrogate.evaluation.velocities import neighbours, velocity_errors
 from surrogate.learned import LearnedMaps, Loaded
 from surrogate.library import Need
 from surrogate.pairs import open_pairs

@@ -1,9 +1,9 @@
 """How wrong the learned maps are, and how fast, beside exact maps at few nodes: tables, pictures and all numbers as JSON.
 
-errors       of each map and mode on held-out test runs, and on a suspension of another kind       `evaluate_errors`
-velocities   advection and flow tension of velocities as they occur                                `evaluate_velocities`
-relaxation   a hundred relaxation steps in a row                                                   `evaluate_relaxation`
-cost         microseconds a vesicle                                                                `evaluate_cost`
+errors       of each map and mode on held-out test runs, and on a suspension of another kind       `errors`
+velocities   advection and flow tension of velocities as they occur                                `velocities`
+relaxation   a hundred relaxation steps in a row                                                   `relaxation`
+cost         microseconds a vesicle                                                                `cost`
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from tqdm import tqdm
 from biem.curves.fourier import resample
 from biem.membrane.maps import ExactMaps, MembraneMaps
 from biem.run.files import write_atomically
-from surrogate.evaluate_cost import costs
-from surrogate.evaluate_errors import map_errors, test_rows
-from surrogate.evaluate_parts import Parts, file_digest, resolved_shapes
-from surrogate.evaluate_plots import draw
-from surrogate.evaluate_relaxation import errors_of_steps, march, reference
-from surrogate.evaluate_rungs import Rung, exact_rungs, learned_rungs, stepped_rungs
-from surrogate.evaluate_tables import markdown
-from surrogate.evaluate_velocities import SLOTS, velocity_errors
+from surrogate.evaluation.cost import costs
+from surrogate.evaluation.errors import map_errors, test_rows
+from surrogate.evaluation.parts import Parts, file_digest, resolved_shapes
+from surrogate.evaluation.plots import draw
+from surrogate.evaluation.relaxation import errors_of_steps, march, reference
+from surrogate.evaluation.rungs import Rung, exact_rungs, learned_rungs, stepped_rungs
+from surrogate.evaluation.tables import markdown
+from surrogate.evaluation.velocities import SLOTS, velocity_errors
 from surrogate.library import KINDS, Need
 from surrogate.pairs import Pairs, open_pairs
 from surrogate.targets import TARGETS
