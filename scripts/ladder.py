@@ -23,6 +23,7 @@ from biem.run.trajectory import Trajectory, read_trajectory
 from biem.scene.config import Scene, load_scene
 
 RUNGS = ("implicit", "split", "hybrid", "mlp", "ivnet")
+SHOWN = RUNGS[:4]
 
 
 def scene_of(path: Path, rung: str, overrides: list[str], points: int | None, weights: Path | None) -> Scene:
@@ -74,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/ladder"))
-    parser.add_argument("--rungs", nargs="+", choices=RUNGS, default=list(RUNGS))
+    parser.add_argument("--rungs", nargs="+", choices=RUNGS, default=list(SHOWN))
     parser.add_argument("--reference-points", type=int, default=64, help="nodes of the first rung")
     parser.add_argument("--weights", type=Path, help="folder of weights; default those that are shipped")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")

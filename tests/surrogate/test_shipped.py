@@ -7,6 +7,7 @@ from surrogate_cases import mild, smooth_field
 from biem.membrane.maps import SLOTS, ExactMaps
 from surrogate.library import KINDS, SHIPPED, find, kind_of, load_maps
 
+SLOTS_OF = {"ivnet": {"relax", "self_tension"}, "mlp": set(SLOTS), "hybrid": set(SLOTS) - {"near"}}
 BOUNDS = {"ivnet": 0.05, "mlp": 0.03, "hybrid": 0.01}  # relative L2 of each map, smooth shapes and velocities
 
 
@@ -25,18 +26,21 @@ def test_they_take_at_most_30_megabytes_and_are_of_one_reduced_area():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_all_maps_of_a_kind_are_near_the_exact_ones(kind):
-    maps, exact = load_maps(kind), ExactMaps(points=128)
+def test_maps_of_a_kind_are_near_the_exact_ones(kind):
+    there = {card.network.map for _, card in find(SHIPPED) if kind_of(card) == kind}
+    assert there == SLOTS_OF[kind]
+    maps, exact = load_maps(kind, slots=there), ExactMaps(points=128)
     X, u = mild(6), smooth_field(6, 4)
-    bound = BOUNDS[kind]
-    assert np.median(relative(maps.advect(X, u), exact.advect(X, u))) < bound
-    assert np.median(relative(maps.flow_tension(X, u), exact.flow_tension(X, u))) < bound
-    assert np.median(relative(maps.self_tension(X), exact.self_tension(X))) < bound
     fine = X
     for _ in range(8):
         fine = exact.relax(fine, 1.25e-6)
-    scale = np.abs(fine - X).max()
-    assert np.median(np.abs(maps.relax(X, 1e-5) - fine).max(axis=(1, 2))) < 2 * bound * scale
-    if kind != "hybrid":
-        assert np.median(relative(maps.near_layers(X, u), exact.near_layers(X, u))) < bound
-    assert set(maps.loaded) == set(SLOTS) - ({"near"} if kind == "hybrid" else set())
+    answers = {
+        "relax": lambda m: (m.relax(X, 1e-5) if m is maps else fine) - X,
+        "self_tension": lambda m: m.self_tension(X),
+        "advection": lambda m: m.advect(X, u),
+        "flow_tension": lambda m: m.flow_tension(X, u),
+        "near": lambda m: m.near_layers(X, u),
+    }
+    for slot in sorted(there):
+        bound = BOUNDS[kind] * (3 if slot == "relax" else 1)  # shapes near equilibrium: increments are small
+        assert np.median(relative(answers[slot](maps), answers[slot](exact))) < bound, slot
