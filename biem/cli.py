@@ -23,7 +23,7 @@ def one_line_errors(ranks: Ranks = ALONE) -> Iterator[None]:
     except NumericalFailure as error:
         fail(str(error), 3, ranks)
     except Stopped as stopped:
-        fail(f"{stopped}; go on with --resume", 4, ranks)
+        fail(str(stopped), 4, ranks)
     except FileNotFoundError as error:
         fail(str(error), 2, ranks)
     except OSError as error:

@@ -44,7 +44,7 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Standard:
-    """Curves in the standard pose: X (M, 2, N) float64 and their frames, as tensors; distances from the training shapes (M,)."""
+    """Curves in the standard pose, X (M, 2, N) float64, and their frames, as tensors."""
 
     X: Tensor
     frames: Tensor
@@ -107,6 +107,7 @@ class LearnedMaps:
         def learned(X: Array) -> Array:
             part = self._part("self_tension")
             standard = self._standardized(X)
+            count("self_tension_network", X.shape[0])
             sigma = _back(part.network(standard.X)[:, 0, 0], X)
             back = standard.pose.scalars_back(sigma) * (self.kappa_b / standard.pose.scale**2)[:, None]
             return _plus(back, part.base, lambda base: base.self_tension(X))
@@ -134,6 +135,7 @@ class LearnedMaps:
 
     def _relaxed(self, X: Array, part: Loaded, dt: float) -> Array:
         standard = self._standardized(X)
+        count("relax_network", X.shape[0])
         increments = from_frame(part.network(standard.X)[:, 0].double(), standard.frames)
         if part.base is not None:
             scale = standard.pose.scale[:, None, None]
@@ -147,7 +149,12 @@ class LearnedMaps:
         standard = self._standardized(X)
         part = self._part(slot)
         u_std = _tensor(standard.pose.vectors(u))
-        operators = self._operator.setdefault(slot, Latest()).of(X, lambda: _chunked(lambda c: part.network(standard.X[c]), standard.X))
+
+        def make() -> Tensor:
+            count(f"{slot}_network", X.shape[0])
+            return _chunked(lambda chunk: part.network(standard.X[chunk]), standard.X)
+
+        operators = self._operator.setdefault(slot, Latest()).of(X, make)
 
         def at(chunk: slice) -> Tensor:
             frames = standard.frames[chunk]

@@ -138,7 +138,7 @@ class _Run:
                     found = self._record(loss)
                     bar.set_postfix(median=f"{found['median']:.2e}", mean=f"{found['mean']:.2e}")
                 if stopping and self.step < self.steps:
-                    raise Stopped(f"{self.job.name} stopped at step {self.step} of {self.steps}")
+                    raise Stopped(f"{self.job.name} stopped at step {self.step} of {self.steps}; the same command goes on")
 
     def _advance(self) -> float:
         t = self.training

@@ -165,7 +165,7 @@ class _Loop:
                 if stopping:
                     self.files.close()
                     where = f"of {self.problem.steps}" if self.controller is None else f"at t = {self.state.t:.6g}"
-                    raise Stopped(f"stopped at step {self.step} {where}")
+                    raise Stopped(f"stopped at step {self.step} {where}; go on with --resume")
 
     def _done(self) -> bool:
         return self.step >= self.problem.steps if self.controller is None else self.state.t >= self.problem.horizon
