@@ -82,10 +82,11 @@ evaluate() {
 }
 
 vesnet() {
-    local options=(--devices cuda --dtypes float32 --counts 48 504 2000)
-    if smoke "${1:-}"; then options=(--devices torch --counts 4 --repeat 1); fi
-    "$PYTHON" scripts/bench_step.py --solvers split vesnet:hybrid vesnet:mlp vesnet:ivnet --weights "$OUT/weights" "${options[@]}" \
-        --limit 120 --json "$OUT/bench_vesnet.json" | tee "$OUT/bench_vesnet.md"
+    local options=(--solvers split vesnet:hybrid vesnet:mlp vesnet:ivnet --weights "$OUT/weights" --devices cuda --dtypes float32 --counts 48 504 2000)
+    if smoke "${1:-}"; then # networks of a few steps of training are stopped by the guard: the shipped ones
+        options=(--solvers split vesnet:hybrid vesnet:mlp --counts 4 --repeat 1)
+    fi
+    "$PYTHON" scripts/bench_step.py "${options[@]}" --limit 120 --json "$OUT/bench_vesnet.json" | tee "$OUT/bench_vesnet.md"
 }
 
 stage="${1:-}"
