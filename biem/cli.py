@@ -5,6 +5,7 @@ Exit codes: 0 done, 2 bad input, 3 failed computation or check, 4 stopped by a s
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -37,6 +38,14 @@ def fail(message: str, code: int, ranks: Ranks = ALONE) -> None:
     if ranks.rank == 0:
         typer.echo(f"error: {message}", err=True)
     raise typer.Exit(code)
+
+
+def read_part(text: str) -> tuple[int, int]:
+    """(K, P) of --part "K/P": of P processes that share the work and do not know each other, the K-th, from 1. Raises ValueError."""
+    found = re.fullmatch(r"(\d+)/(\d+)", text.strip())
+    if not found or not 1 <= int(found[1]) <= int(found[2]):
+        raise ValueError(f'--part {text}: expected K/P with K from 1 to P, as in "2/8"')
+    return int(found[1]), int(found[2])
 
 
 def first_rank_only() -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from pydantic import Field
 
+from biem.cli import read_part
 from biem.run.files import write_atomically
 from biem.scene.tables import Table, flat, validated
 
@@ -83,10 +84,7 @@ class Part:
     @staticmethod
     def parse(text: str) -> Part:
         """Of "K/P". Raises ValueError."""
-        found = re.fullmatch(r"(\d+)/(\d+)", text.strip())
-        if not found or not 1 <= int(found[1]) <= int(found[2]):
-            raise ValueError(f'--part {text}: expected K/P with K from 1 to P, as in "2/8"')
-        return Part(int(found[1]), int(found[2]))
+        return Part(*read_part(text))
 
     def has(self, task: int) -> bool:
         return task % self.of == self.k - 1

@@ -11,13 +11,13 @@ import torch
 import typer
 
 import biem.__main__ as biem_cli
-from biem.cli import fail, first_rank_only, one_line_errors
+from biem.cli import first_rank_only, one_line_errors, read_part
 from biem.ranks import Ranks, world
 from biem.run.solver import check_device
 from surrogate.config import Training, load_training
 from surrogate.evaluation import PARTS, Options, evaluate
 from surrogate.grid import grid_table, variants
-from surrogate.jobs import Work, cost, dealt, pick, pick_all, read_part
+from surrogate.jobs import Work, cost, dealt, pick, pick_all
 from surrogate.library import KINDS
 from surrogate.merge import merge
 from surrogate.pairs import open_pairs
@@ -62,7 +62,9 @@ def train_command(
         if every == (name is not None) or (every and mode is not None):
             raise ValueError("give either --map, with or without --mode, or --all")
         works = pick_all(settings, pairs, output, grouped) if every else pick(settings, pairs, output, str(name), mode, grouped)
-        _train_mine(works, settings, ranks, device, part, quiet)
+        k, parts = _share(ranks, part)
+        for work in dealt(works, partial(cost, settings), parts)[k - 1]:
+            _train(work, settings, device, quiet)
 
 
 @app.command("merge")
@@ -135,9 +137,10 @@ def grid_command(
         pairs = ranks.on_root(lambda: [open_pairs(path) for path in data])
         chosen = variants(settings, blocks, widths, levels)
         works = [(pick(one, pairs, output / label, name, mode), one) for label, one in chosen.items()]
-        for index, (jobs, one) in enumerate(works):
-            if index % ranks.size == ranks.rank:
-                _train_mine(jobs, one, Ranks(), device, part, quiet)
+        k, parts = _share(ranks, part)
+        for jobs, one in works[k - 1 :: parts]:
+            for work in jobs:
+                _train(work, one, device, quiet)
         ranks.any(False)  # all are there
         if ranks.rank == 0 and part is None:
             typer.echo(grid_table(output, chosen))
@@ -164,18 +167,24 @@ def _overrides(arch: str | None, target: str | None, overrides: list[str] | None
     return [*(overrides or []), *(f'{key}="{value}"' for key, value in named.items() if value is not None)]
 
 
-def _train_mine(works: list[Work], settings: Training, ranks: Ranks, device: str, part: str | None, quiet: bool) -> None:
+def _share(ranks: Ranks, part: str | None) -> tuple[int, int]:
+    """(K, P): of P processes, this is the K-th, from 1."""
+    if part is None:
+        return ranks.rank + 1, ranks.size
+    if ranks.size > 1:
+        raise ValueError("--part is for processes that do not know each other: leave it out under mpirun")
+    return read_part(part)
+
+
+def _train(work: Work, settings: Training, device: str, quiet: bool) -> None:
     if device == "cpu":
         torch.set_num_threads(1)  # networks are small: a second thread costs more than it gives
     else:
         check_device(device, "--device")
-    if part is not None and ranks.size > 1:
-        fail("--part is for processes that do not know each other: leave it out under mpirun", 2, ranks)
-    k, parts = (ranks.rank + 1, ranks.size) if part is None else read_part(part)
-    for job, pairs in dealt(works, partial(cost, settings), parts)[k - 1]:
-        path = train(settings, job, pairs, device=device, progress=not quiet)
-        if not quiet:
-            typer.echo(str(path))
+    job, pairs = work
+    path = train(settings, job, pairs, device=device, progress=not quiet)
+    if not quiet:
+        typer.echo(str(path))
 
 
 if __name__ == "__main__":

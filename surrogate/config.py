@@ -63,7 +63,8 @@ class Training(Table):
         if name not in TARGETS:
             raise ValueError(f"there is no map {name}: expected one of {', '.join(TARGETS)}")
         tables = {"network": self.network.model_dump(), "training": self.training.model_dump()}
-        for key, value in self.map.get(name, {}).items():  # type: ignore[call-overload]
+        own = next((table for key, table in self.map.items() if key == name), {})
+        for key, value in own.items():
             places = [table for table in tables.values() if key in table]
             if not places:
                 raise ValueError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -64,11 +63,3 @@ def dealt(works: Iterable[Work], cost: Callable[[Work], float], parts: int) -> l
         hands[least].append(work)
         loads[least] += cost(work)
     return hands
-
-
-def read_part(text: str) -> tuple[int, int]:
-    """(K, P) of "K/P". Raises ValueError."""
-    found = re.fullmatch(r"(\d+)/(\d+)", text.strip())
-    if not found or not 1 <= int(found[1]) <= int(found[2]):
-        raise ValueError(f'--part {text}: expected K/P with K from 1 to P, as in "2/8"')
-    return int(found[1]), int(found[2])

@@ -105,3 +105,11 @@ def test_the_grid_prints_a_table_and_goes_on(pairs_path, tmp_path):
     assert first.exit_code == 0, first.output
     assert len([line for line in first.output.splitlines() if line.startswith("| 1 |")]) == 2
     assert call(*options, "--quiet", *QUICK).output == first.output
+
+
+def test_parts_of_a_grid_share_its_variants(pairs_path, tmp_path):
+    options = ["grid", "--data", pairs_path, "--map", "self_tension", "-o", tmp_path, "--blocks", "1", "--widths", "4,8", "--levels", "1"]
+    for k, there in ((2, {"b1-w8-l1"}), (1, {"b1-w4-l1", "b1-w8-l1"})):
+        done = call(*options, "--part", f"{k}/2", "--quiet", *QUICK)
+        assert done.exit_code == 0, done.output
+        assert {path.parents[1].name for path in tmp_path.rglob("weights.safetensors")} == there

@@ -5,9 +5,10 @@ from functools import partial
 
 import pytest
 
+from biem.cli import read_part
 from surrogate.config import load_training
 from surrogate.grid import variants
-from surrogate.jobs import cost, dealt, pick, pick_all, read_part
+from surrogate.jobs import cost, dealt, pick, pick_all
 
 IVNET, MLP = load_training(None, ["network.arch=ivnet"]), load_training(None)
 RESIDUAL = load_training(None, ["network.target=residual"])
