@@ -146,18 +146,20 @@ def scatter_add(u: Array, index: Array, values: Array) -> Array:
 
 
 class Latest:
-    """Remembers what was made for the object last seen: known by its identity, so an array must not change in place."""
+    """Remembers what was made for the `keep` objects last seen: known by their identity, so an array must not change in place."""
 
-    def __init__(self) -> None:
-        self._object: Any = None
-        self._made: Any = None
+    def __init__(self, keep: int = 1) -> None:
+        self._keep = keep
+        self._seen: tuple[tuple[Any, Any], ...] = ()
 
     def of(self, key: Any, make: Callable[[], Any]) -> Any:
         """What `make()` gave for this very object, made now if it is another one."""
-        if self._object is not key:
-            self._made = make()
-            self._object = key
-        return self._made
+        for known, made in self._seen:
+            if known is key:
+                return made
+        made = make()
+        self._seen = (*self._seen, (key, made))[-self._keep :]
+        return made
 
 
 def threads() -> int:

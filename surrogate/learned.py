@@ -25,11 +25,12 @@ from biem.membrane.maps import ExactMaps
 from surrogate.damping import damped
 from surrogate.features import frame
 from surrogate.networks import LearnedMap
-from surrogate.targets import apply_kernel, apply_modes, from_frame
+from surrogate.targets import from_frame
 from surrogate.weights import Card
 
 CPU_CHUNK, DEVICE_CHUNK = 128, 4096  # vesicles at a time: their operators stay in the cache, in the memory
 SAME_DT = 1e-2  # relative difference of time steps that counts as none: lengths of membranes vary by less than a third of it
+KEPT = 4  # standardized shapes: of a step all vesicles, those with near pairs, and those that are being moved
 LIMITS = ("flag", "exact", "refuse")
 
 
@@ -64,7 +65,7 @@ class LearnedMaps:
     mu: float = 1.0
     exact: ExactMaps = field(default_factory=ExactMaps)
     limits: str = "flag"
-    _standard: Latest = field(default_factory=Latest, init=False, repr=False, compare=False)
+    _standard: Latest = field(default_factory=partial(Latest, KEPT), init=False, repr=False, compare=False)
     _outside: Latest = field(default_factory=Latest, init=False, repr=False, compare=False)
     _operator: dict[str, Latest] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -152,15 +153,13 @@ class LearnedMaps:
 
         def make() -> Tensor:
             count(f"{slot}_network", X.shape[0])
-            return _chunked(lambda chunk: part.network(standard.X[chunk]), standard.X)
+            return _chunked(lambda chunk: part.network.operators(standard.X[chunk]), standard.X)
 
         operators = self._operator.setdefault(slot, Latest()).of(X, make)
 
         def at(chunk: slice) -> Tensor:
             frames = standard.frames[chunk]
-            A = operators[chunk]
-            of_modes = part.card.network.arch == "ivnet"
-            v = apply_modes(A, u_std[chunk]) if of_modes else apply_kernel(A[:, 0], u_std[chunk], frames)
+            v = part.network.apply_to(operators[chunk], u_std[chunk], frames)
             return from_frame(v.double(), frames) if v.shape[2] == 2 else v.double()
 
         return _back(_chunked(at, standard.X), X), standard.pose

@@ -6,9 +6,9 @@ of that architecture; "hybrid": residual ones.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -76,7 +76,8 @@ def load_maps(
     need = need or Need(32, 0.65)
     exact = exact or ExactMaps(kappa_b, mu)
     wanted = [slot for slot in SLOTS if (slots is None or slot in slots) and not (kind == "hybrid" and slot == "near")]
-    loaded = {slot: _load(kind, slot, Path(weights or SHIPPED), need, exact) for slot in wanted}
+    base = cache(lambda points: replace(exact, points=points))  # one for all maps of as many nodes: they share what it builds of a shape
+    loaded = {slot: _load(kind, slot, Path(weights or SHIPPED), need, base) for slot in wanted}
     return LearnedMaps(loaded, kappa_b, mu, exact, limits)
 
 
@@ -96,7 +97,7 @@ def _card_of(path: Path, changed: int) -> Card:
     return read_card(path)
 
 
-def _load(kind: str, slot: str, folder: Path, need: Need, exact: ExactMaps) -> tuple[Loaded, ...]:
+def _load(kind: str, slot: str, folder: Path, need: Need, base: Callable[[int], ExactMaps]) -> tuple[Loaded, ...]:
     cards = [(path, card) for path, card in find(folder) if kind_of(card) == kind and card.network.map == slot]
     if not cards:
         raise ValueError(f"{folder} has no weights of {slot} for solver.maps = {kind!r}: train them, or choose other maps")
@@ -109,7 +110,7 @@ def _load(kind: str, slot: str, folder: Path, need: Need, exact: ExactMaps) -> t
             raise ValueError(f"{folder} has several weights of {slot} ({kind}) that fit, such as {path.name} and {other.name}: leave one")
     if slot == "relax":
         _check_steps([card for _, card in fitting], need)
-    return tuple(_read(path, exact) for path, _ in fitting)
+    return tuple(_read(path, base) for path, _ in fitting)
 
 
 def _misfit(card: Card, need: Need) -> str:
@@ -140,6 +141,6 @@ def _check_steps(cards: list[Card], need: Need) -> None:
             )
 
 
-def _read(path: Path, exact: ExactMaps) -> Loaded:
+def _read(path: Path, base: Callable[[int], ExactMaps]) -> Loaded:
     network, card = read_weights(path)
-    return Loaded(network, card, None if card.base_points is None else replace(exact, points=card.base_points))
+    return Loaded(network, card, None if card.base_points is None else base(card.base_points))

@@ -18,8 +18,8 @@ from surrogate.distribution import Distribution
 from surrogate.features import features
 from surrogate.ivnet import IVNet
 from surrogate.mlp import MLP
-from surrogate.symmetric import Parts
-from surrogate.targets import TARGETS
+from surrogate.symmetric import Parts, Rows
+from surrogate.targets import TARGETS, apply_modes, to_frame
 
 Arch = Literal["ivnet", "mlp"]
 
@@ -85,6 +85,15 @@ class IVNetMap(nn.Module):
         y = self.normalized(values).clamp(self.lowest, self.highest) * self.output_scale + self.output_mean  # (G, M, N, out)
         return y.permute(1, 0, 3, 2).reshape(len(values), self.groups, *self.settings.output_shape)
 
+    def operators(self, X: Tensor) -> Tensor:
+        """Of velocities, all modes (M, G, *output_shape), for `apply_to`."""
+        out: Tensor = self(X)
+        return out
+
+    def apply_to(self, operators: Tensor, u: Tensor, frames: Tensor) -> Tensor:
+        """Parts (M, S, C, N) of the answers to velocities u (M, 2 [x, y], N)."""
+        return apply_modes(operators, u)
+
     def normalized(self, values: Tensor) -> Tensor:
         """The core's outputs (G, M, N, out)."""
         return self.core(torch.asinh((values - self.input_mean) / self.input_scale))
@@ -99,7 +108,9 @@ class MLPMap(nn.Module):
         super().__init__()
         self.settings = settings
         self.distribution = Distribution(settings.points)
-        self.parts = Parts(settings.map, settings.output_shape)
+        shape = settings.output_shape
+        self.rows = Rows(settings.map, shape) if TARGETS[settings.map].operator else None
+        self.parts = self.rows.parts if self.rows else Parts(settings.map, shape)
         into, rank = len(settings.channels) * settings.points, sum(settings.ranks)
         self.core = MLP(into, rank, **settings.network)
         self.register_buffer("input_mean", torch.zeros(into))
@@ -110,8 +121,35 @@ class MLPMap(nn.Module):
         self.register_buffer("output_mean", torch.zeros(self.parts.size))  # of the even part: the others have none
         self.register_buffer("basis", torch.zeros(rank, self.parts.size))
 
+        self._basis_rows: tuple[Tensor, list[Tensor], Tensor] | None = None  # basis, its rows, those of the mean
+
     def forward(self, X: Tensor) -> Tensor:
         return self.outputs(self.coefficients(self.features(X))).reshape(len(X), 1, *self.settings.output_shape)
+
+    @torch.no_grad()
+    def operators(self, X: Tensor) -> Tensor:
+        """Of velocities, in the form that `apply_to` takes: less work than the whole kernel, that calling gives."""
+        assert self.rows is not None
+        basis, mean = self._rows_of_basis()
+        c = self.coefficients(self.features(X)).split(self.settings.ranks, dim=1)
+        parts = torch.empty((len(X), 4, mean.shape[1]), dtype=mean.dtype, device=mean.device)
+        for i in range(4):
+            torch.mm(c[i], basis[i], out=parts[:, i])
+        parts[:, 0] += mean
+        return self.rows.images(parts)
+
+    def apply_to(self, operators: Tensor, u: Tensor, frames: Tensor) -> Tensor:
+        """Parts (M, S, C, N) of the answers to velocities u (M, 2 [x, y], N)."""
+        assert self.rows is not None
+        return self.rows.apply_to(operators, to_frame(u, frames).to(operators.dtype))
+
+    def _rows_of_basis(self) -> tuple[list[Tensor], Tensor]:
+        """Made once of a basis."""
+        assert self.rows is not None
+        if self._basis_rows is None or self._basis_rows[0] is not self.basis:
+            each = [self.rows.of_part(i, vectors) for i, vectors in enumerate(self.basis.split(self.settings.ranks))]
+            self._basis_rows = self.basis, each, self.rows.of_part(0, self.output_mean[None])
+        return self._basis_rows[1:]
 
     def features(self, X: Tensor) -> Tensor:
         """(M, C N) float32."""

@@ -20,7 +20,7 @@ from datagen.shapes import decode, read_shapes
 from surrogate.distribution import Distribution
 from surrogate.features import CHANNELS
 from surrogate.networks import Settings, make_network
-from surrogate.targets import TARGETS
+from surrogate.targets import TARGETS, apply_kernel, apply_modes
 from surrogate.weights import Card
 
 N, K = 32, 17
@@ -167,6 +167,12 @@ class Exactly(torch.nn.Module):
         if self.base is not None:
             values = values - exact_outputs(self.settings, X.numpy(), self.base, self.dt)
         return torch.from_numpy(values)
+
+    def operators(self, X):
+        return self(X)
+
+    def apply_to(self, A, u, frames):
+        return apply_modes(A, u) if self.settings.arch == "ivnet" else apply_kernel(A[:, 0], u, frames)
 
 
 # --- networks and cards

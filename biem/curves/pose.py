@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from array_api_compat import array_namespace
 
 from biem.backend import Array, rfft
-from biem.curves.curve import center_of_nodes, centroid, cross, dot, inclination, inertia_tensor, length
+from biem.curves.curve import center_of_nodes, cross, dot, length
 from biem.curves.fourier import derivative, remove_nyquist, resample, shift
 
 REFINEMENT = 3  # the third moment is of fifth degree in the modes |k| < N/2 of X
@@ -81,25 +81,28 @@ def standardize(X: Array) -> tuple[Array, Pose]:
     origin = center_of_nodes(X)
     local = remove_nyquist(X - origin)
     fine = resample(local, REFINEMENT * X.shape[-1])
-    center = centroid(fine)
+    slope = derivative(fine)
+    weight = cross(fine, slope)
+    xp = array_namespace(X)
+    center = xp.sum(fine * weight[:, None], axis=-1) / (1.5 * xp.sum(weight, axis=-1))[:, None]
     fine = fine - center[..., None]
-    angle = _upright(fine)
+    angle = _upright(fine, slope)
     offset = -(angle + _fundamental_phase(local))
     placed = _rotate(shift(local - center[..., None], offset[:, None]), angle)
     scale = length(placed)
     return placed / scale[:, None, None], Pose(origin[..., 0] + center, angle, scale, offset)
 
 
-def _upright(X: Array) -> Array:
-    """Angle (M,) to turn X by, its centroid at the origin."""
+def _upright(X: Array, slope: Array) -> Array:
+    """Angle (M,) to turn X by, its centroid at the origin. slope: dX/dalpha."""
     xp = array_namespace(X)
-    J = inertia_tensor(X)
+    weight = cross(X, slope)
+    x2, y2 = xp.sum(X**2 * weight[:, None], axis=-1).T
+    twice, difference = 2.0 * xp.sum(X[:, 0] * X[:, 1] * weight, axis=-1), x2 - y2
     negligible = float(xp.finfo(X.dtype).eps) ** 0.5
-    difference = xp.hypot(2.0 * J[:, 0, 1], J[:, 1, 1] - J[:, 0, 0])
-    axis = xp.where(difference > negligible * (J[:, 0, 0] + J[:, 1, 1]), inclination(X), xp.zeros_like(difference))
+    axis = xp.where(xp.hypot(twice, difference) > negligible * (x2 + y2), 0.5 * xp.atan2(twice, difference), xp.zeros_like(difference))
     angle = 0.5 * xp.pi - axis
     r2 = dot(X, X)
-    weight = cross(X, derivative(X))
     third = _rotate(xp.sum(r2[:, None] * X * weight[:, None], axis=-1)[..., None], angle)[..., 0]
     size = xp.sum(r2**1.5 * xp.abs(weight), axis=-1)
     return xp.where(third[:, 0] + third[:, 1] < -negligible * size, angle + xp.pi, angle)

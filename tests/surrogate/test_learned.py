@@ -9,8 +9,10 @@ from surrogate_cases import IVNET, MLP, Exactly, N, card_of, drawn, mild, placed
 
 from biem.backend import counting, to_numpy
 from biem.curves.curve import length
+from biem.curves.pose import standardize
 from biem.errors import NumericalFailure
 from biem.membrane.maps import SLOTS, ExactMaps
+from surrogate import learned
 from surrogate.damping import damped, least_damping
 from surrogate.learned import LearnedMaps, Loaded, composition
 
@@ -216,6 +218,19 @@ def test_networks_are_given_the_standard_pose_once_for_one_curve():
     assert np.abs(part.network.seen[0].numpy() - mild(3)).max() < 1e-12
     assert np.array_equal(maps.advect(X + 0.0, u), first)
     assert len(part.network.seen) == 2
+
+
+def test_curves_that_take_turns_are_standardized_once(monkeypatch):
+    """As those of a step do: all vesicles, those with near pairs, those that are being moved."""
+    X, u = world()
+    curves, poses = [X + k for k in range(4)], []
+    monkeypatch.setattr(learned, "standardize", lambda X: poses.append(X) or standardize(X))
+    maps = LearnedMaps({slot: (loaded(slot),) for slot in ("advection", "flow_tension")})
+    for _ in range(3):
+        for Y in curves:
+            maps.advect(Y, u)
+            maps.flow_tension(Y, u)
+    assert len(poses) == 4
 
 
 def network_maps(kinds=None, limits="flag", base=None, seed=1):

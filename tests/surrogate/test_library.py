@@ -69,6 +69,15 @@ def test_a_base_is_of_the_cards_nodes_and_the_scenes_units(shelf):
     assert load_maps("mlp", shelf, kappa_b=2.0, mu=3.0, slots=["relax"]).exact == ExactMaps(2.0, 3.0)
 
 
+def test_corrected_maps_of_one_shape_are_built_once(shelf):
+    maps, X, u = load_maps("hybrid", shelf), mild(2), np.ones((2, 2, 32))
+    with counting() as counts:
+        maps.self_tension(X)
+        maps.flow_tension(X, u)
+        maps.advect(X, u)
+    assert counts["tension_matrix"] == len(X)
+
+
 def test_relaxations_come_with_the_longest_step_first(shelf):
     assert [part.card.dt for part in load_maps("mlp", shelf).loaded["relax"]] == [1e-4, 1e-5]
 

@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from surrogate_cases import N, drawn, mild, settings_for
+from surrogate_cases import OPERATORS, N, drawn, mild, settings_for, smooth_field
 
 from surrogate.data import Source, basis_data, principal_components
+from surrogate.features import frame
 from surrogate.ivnet import BatchNorm
 from surrogate.merge import folded, merged
 from surrogate.networks import IVNetMap, MLPMap, Settings, make_network
 from surrogate.symmetric import CHARACTERS, Parts
-from surrogate.targets import SYMMETRIES, TARGETS
+from surrogate.targets import SYMMETRIES, TARGETS, apply_kernel
 
 
 def curves(count=3):
@@ -110,6 +111,20 @@ def test_the_parts_of_outputs(name):
             signs.append(1 if relative(moved, alone[i]) < 1e-6 else -1 if relative(-moved, alone[i]) < 1e-6 else 0)
         assert signs == CHARACTERS[i].tolist()
     assert len({tuple(row) for row in CHARACTERS.tolist()}) == 4
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+def test_operators_by_their_rows_act_as_the_whole_kernel(name):
+    network = drawn(settings_for(name))
+    X = curves()
+    u, F = torch.from_numpy(smooth_field(len(X), seed=3)), frame(X)
+    u += torch.randn(u.shape, generator=torch.Generator().manual_seed(0), dtype=u.dtype)  # all modes, of no symmetry
+    expected = apply_kernel(network(X)[:, 0], u, F)
+    operators = network.operators(X)
+    assert operators.shape[:3] == (len(X), 4, 2 * (N // 4 + 1))  # little more than a quarter of the sources
+    assert relative(network.apply_to(operators, u, F), expected) < 1e-5
+    moved = network.to(torch.float64)  # what was made of the basis is made anew
+    assert relative(moved.apply_to(moved.operators(X), u, F), expected) < 1e-5
 
 
 @pytest.mark.parametrize("arch", ["ivnet", "mlp"])
