@@ -1,3 +1,4 @@
+# make smoke: every stage of the GPU pipeline on small cases, on the CPU.
 # make demo: set up everything, run two vesicles in shear, by every solver, and 100 in a parabolic flow, make a small data set: in out/demo.
 # make dataset: harvest and select the shapes of configs/datagen/default.toml into data/default, or go on with that.
 # make test: set up everything, run the tests, on as many processes as there are cores.
@@ -6,7 +7,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 export OMP_WAIT_POLICY = PASSIVE
 
-.PHONY: setup demo dataset test lint clean
+.PHONY: setup demo dataset smoke test lint clean
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt
@@ -27,6 +28,9 @@ demo: $(READY)
 dataset: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/mpirun -n $$(nproc) $(BIN)/python -m datagen harvest configs/datagen/default.toml -o data/default
 	$(BIN)/python -m datagen select configs/datagen/default.toml -o data/default
+
+smoke: $(READY)
+	PYTHON=$(BIN)/python OUT=out/smoke bash scripts/gpu_pipeline.sh all --smoke
 
 test: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile

@@ -21,6 +21,5 @@ config=(configs/datagen/small.toml -o "$folder/data" --set "shapes.reduced_area=
 "${run[@]}" datagen make "${config[@]}"
 "${run[@]}" datagen label "${config[@]}" --name flow1e-5 --maps relax --set label.relaxation=converged --set label.operator_points=96
 "${run[@]}" surrogate train --all --data "$folder/data/pairs.h5" --data "$folder/data/pairs-flow1e-5.h5" -o "$folder/runs" \
-    --config configs/train/hybrid.toml --set training.samples=200_000 --set map.relax.samples=200_000 --set network.width=128 \
-    --set map.relax.width=128 --set map.advection.width=128 "$@"
+    --config configs/train/small.toml "$@"
 "$python" -m surrogate merge "$folder/runs" -o "$folder/weights"

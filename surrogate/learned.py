@@ -18,7 +18,7 @@ from array_api_compat import array_namespace
 from torch import Tensor
 
 from biem.backend import Array, Latest, count, from_numpy, on_cpu, parallel_map, shares, to_numpy
-from biem.curves.curve import length, speed
+from biem.curves.curve import center_of_nodes, cross, dot, length, speed
 from biem.curves.pose import Pose, standardize
 from biem.errors import NumericalFailure
 from biem.membrane.maps import ExactMaps
@@ -73,8 +73,9 @@ class LearnedMaps:
         """(1 - M) u (M, 2, N)."""
 
         def learned(X: Array, u: Array) -> Array:
-            v, pose = self._applied("advection", X, u)
-            return _plus(pose.vectors_back(v[:, 0]), self._base("advection"), lambda base: base.advect(X, u))
+            rigid, base = rigid_motion(X, u), self._base("advection")
+            v, pose = self._applied("advection", X, u - rigid)
+            return pose.vectors_back(v[:, 0]) + (rigid if base is None else base.advect(X, u))
 
         return self._limited(learned, self.exact.advect, X, u)
 
@@ -82,7 +83,7 @@ class LearnedMaps:
         """L^-1 P u (M, N)."""
 
         def learned(X: Array, u: Array) -> Array:
-            v, pose = self._applied("flow_tension", X, u)
+            v, pose = self._applied("flow_tension", X, u - rigid_motion(X, u))
             return _plus(self.mu * pose.scalars_back(v[:, 0, 0]), self._base("flow_tension"), lambda base: base.flow_tension(X, u))
 
         return self._limited(learned, self.exact.flow_tension, X, u)
@@ -211,6 +212,14 @@ class LearnedMaps:
         out = xp.asarray(learned(X, *fields), copy=True)
         out[which] = exact(X[which], *(f[which] for f in fields))
         return out
+
+
+def rigid_motion(X: Array, u: Array) -> Array:
+    """The translation and rotation (M, 2, N) next to u, in least squares: membranes follow them, without a tension, exactly."""
+    xp = array_namespace(X)
+    r = X - center_of_nodes(X)
+    spin = xp.sum(cross(r, u), axis=-1) / xp.sum(dot(r, r), axis=-1)
+    return center_of_nodes(u) + spin[:, None, None] * xp.stack([-r[:, 1], r[:, 0]], axis=1)
 
 
 def composition(dt: float, known: list[float]) -> tuple[list[int], float]:

@@ -244,6 +244,19 @@ def network_maps(kinds=None, limits="flag", base=None, seed=1):
 
 
 @pytest.mark.parametrize("kind", ["ivnet", "mlp", "hybrid"])
+def test_rigid_motions_are_followed_whatever_the_networks_say(kind):
+    """However fast: a vesicle far from the origin of a flow moves much faster than it deforms."""
+    X, _ = world()
+    maps = network_maps(dict.fromkeys(SLOTS, "ivnet" if kind == "ivnet" else "mlp"), base=48 if kind == "hybrid" else None)
+    r = X - X.mean(axis=-1, keepdims=True)
+    u = 1e3 * np.array([1.0, -2.0])[:, None] + 30.0 * np.stack([-r[:, 1], r[:, 0]], axis=1)
+    assert np.abs(maps.advect(X, u) - u).max() < 1e-9 * np.abs(u).max()
+    few = smooth_field(3)
+    shifted = maps.flow_tension(X, few + u)
+    assert np.abs(shifted - maps.flow_tension(X, few)).max() < 1e-5 * np.abs(shifted).max()
+
+
+@pytest.mark.parametrize("kind", ["ivnet", "mlp", "hybrid"])
 def test_numpy_and_torch_arrays_give_the_same(kind):
     X, u = mild(3), smooth_field(3)
     maps = network_maps(dict.fromkeys(SLOTS, "ivnet" if kind == "ivnet" else "mlp"), base=32 if kind == "hybrid" else None)

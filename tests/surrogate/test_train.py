@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -15,6 +16,7 @@ from surrogate import learner
 from surrogate import train as module
 from surrogate.config import load_training
 from surrogate.pairs import open_pairs
+from surrogate.targets import TARGETS
 from surrogate.train import Job, read_log, train
 from surrogate.weights import read_checkpoint, read_weights, save_weights
 
@@ -337,3 +339,9 @@ def test_what_a_run_was_stands_beside_it(tmp_path, pairs):
     assert found["modes"] == [2]
     assert found["data"] == pairs.digest
     assert found["training"]["network"]["width"] == 8
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "configs" / "train").glob("*.toml")), ids=lambda path: path.stem)
+def test_the_training_files_are_valid(path):
+    config = load_training(path)
+    assert all(config.of(name).training.samples >= 1000 for name in TARGETS)
