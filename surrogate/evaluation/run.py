@@ -30,7 +30,7 @@ from surrogate.evaluation.relaxation import errors_of_steps, march, reference
 from surrogate.evaluation.rungs import Rung, exact_rungs, learned_rungs, stepped_rungs
 from surrogate.evaluation.tables import markdown
 from surrogate.evaluation.velocities import SLOTS, velocity_errors
-from surrogate.library import KINDS, Need
+from surrogate.library import KINDS, Need, find
 from surrogate.pairs import Pairs, open_pairs
 from surrogate.targets import TARGETS
 
@@ -116,6 +116,8 @@ def _check(options: Options) -> None:
     unknown = [name for name in options.only if name not in PARTS] + [kind for kind in options.kinds if kind not in KINDS]
     if unknown:
         raise ValueError(f"there is no {unknown[0]!r} to evaluate: parts are {', '.join(PARTS)}, kinds {', '.join(KINDS)}")
+    if options.weights is not None:
+        find(options.weights)
     if options.substeps < 2 or options.substeps % 2:
         raise ValueError(f"substeps = {options.substeps}: expected an even number, the reference takes all of them and half of them")
 

@@ -309,6 +309,11 @@ def test_wrong_options_get_one_line(options, wrong, text):
     assert "\n" not in str(caught.value)
 
 
+def test_a_folder_without_any_weights_is_refused(options, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no weights"):
+        evaluate(replace(options, weights=tmp_path))
+
+
 def test_kinds_without_weights_are_left_out_with_lines(tmp_path):
     rungs, notes = learned_rungs(("mlp", "hybrid"), tmp_path, Need(32, 0.65))
     assert rungs == []
