@@ -15,7 +15,10 @@ Channel = Literal["x", "y", "normal_x", "normal_y", "speed", "curvature", "curva
 
 
 class NetworkTable(Table):
-    """arch: "ivnet", one network a mode, or "mlp", one for all modes. target: "residual" is against exact maps at base_points nodes."""
+    """arch: "ivnet", one network a mode, or "mlp", one for all modes. target: "residual" is against exact maps at base_points nodes.
+
+    rolloff: errors of an operator in mode k count as 1/(1 + (k/rolloff)^2), as the velocities that it will act on have them; of "mlp".
+    """
 
     arch: Literal["ivnet", "mlp"] = "mlp"
     target: Literal["full", "residual"] = "full"
@@ -24,6 +27,7 @@ class NetworkTable(Table):
     blocks: int = Field(2, ge=1)
     width: int = Field(512, ge=2)
     rank: int = Field(512, ge=1)  # mlp: coefficients of the output
+    rolloff: float | None = Field(None, gt=0)
     levels: int = Field(2, ge=1)  # ivnet, as what follows
     growth: float = Field(1.5, gt=0)
     activation: Literal["silu", "relu", "gelu"] = "silu"

@@ -66,7 +66,7 @@ class Source:
         else:
             labels = labels[:, :, :, :, None] if target.parts == 2 else labels[:, :, :, :, None, None]
         if settings.arch == "mlp":
-            return kernel_of_modes(labels, F)[:, None]
+            return kernel_of_modes(labels, F, settings.rolloff)[:, None]
         return torch.stack([demodulated(labels[:, i], k, F) for i, k in enumerate(self.modes)], dim=1)
 
     def image(self, outputs: Tensor, index: int) -> Tensor:

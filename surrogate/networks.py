@@ -19,7 +19,7 @@ from surrogate.features import features
 from surrogate.ivnet import IVNet
 from surrogate.mlp import MLP
 from surrogate.symmetric import Parts, Rows
-from surrogate.targets import TARGETS, apply_modes, to_frame
+from surrogate.targets import TARGETS, apply_modes, roughened, to_frame
 
 Arch = Literal["ivnet", "mlp"]
 
@@ -29,6 +29,7 @@ class Settings:
     """What a network is of. modes: of an operator, one network for each of "ivnet"; () for other maps, and all of them for "mlp".
 
     network: blocks, width, ... of the IVNet or MLP; ranks: coefficients of each part of an MLP's output (`surrogate.symmetric`).
+    rolloff: of an MLP's kernels (`surrogate.targets`).
     """
 
     map: str
@@ -38,6 +39,7 @@ class Settings:
     modes: tuple[int, ...] = ()
     network: dict[str, Any] = field(default_factory=dict)
     ranks: tuple[int, ...] = ()
+    rolloff: float | None = None
 
     @classmethod
     def from_dict(cls, table: dict[str, Any]) -> Settings:
@@ -141,7 +143,7 @@ class MLPMap(nn.Module):
     def apply_to(self, operators: Tensor, u: Tensor, frames: Tensor) -> Tensor:
         """Parts (M, S, C, N) of the answers to velocities u (M, 2 [x, y], N)."""
         assert self.rows is not None
-        return self.rows.apply_to(operators, to_frame(u, frames).to(operators.dtype))
+        return self.rows.apply_to(operators, to_frame(roughened(u, self.settings.rolloff), frames).to(operators.dtype))
 
     def _rows_of_basis(self) -> tuple[list[Tensor], Tensor]:
         """Made once of a basis."""

@@ -5,7 +5,8 @@ linear in a velocity u, has one of two forms, d or a the direction of the input,
 
     modes    D_k[d, s, c, j] = e^{-ik alpha_j} (A e^{ik alpha} e_d)[s, c, j]     complex, k = 0..N/2; a network for each k. Demodulated, it
              goes with the nodes when the first node is shifted
-    kernel   A[a, i, s, c, j]     the response to the part a of u at node i; one network for all
+    kernel   A[a, i, s, c, j]     the response to the part a of w at node i; one network for all. Mode k of w is that of u over f_k: with
+             f_k = 1/(1 + (k/rolloff)^2) a loss of kernels counts velocities as smooth as they are (w = u, f_k = 1 with no rolloff)
 
     S = 1 layer, c = normal, tangential: advection;   S = 1, C = 1: flow_tension;   S = 5, C = 2: near.   relax (2, N), self_tension (1, N)
 """
@@ -110,16 +111,30 @@ def demodulated(T: Tensor, k: int, frames: Tensor) -> Tensor:
     return torch.stack([T[:, 0] * c + T[:, 1] * s, T[:, 1] * c - T[:, 0] * s], dim=1).float()
 
 
-def kernel_of_modes(T: Tensor, frames: Tensor) -> Tensor:
+def spectrum(N: int, rolloff: float | None) -> Tensor:
+    """f_k (N/2 + 1,) float64."""
+    k = torch.arange(N // 2 + 1, dtype=torch.float64)
+    return torch.ones_like(k) if rolloff is None else 1.0 / (1.0 + (k / rolloff) ** 2)
+
+
+def roughened(u: Tensor, rolloff: float | None) -> Tensor:
+    """w (n, 2, N) of velocities u."""
+    if rolloff is None:
+        return u
+    N = u.shape[-1]
+    return torch.fft.irfft(torch.fft.rfft(u) / spectrum(N, rolloff).to(u), n=N)
+
+
+def kernel_of_modes(T: Tensor, frames: Tensor, rolloff: float | None = None) -> Tensor:
     """A (n, 2 [a], N [i], S, C, N) float32 of the labels T (n, K, 2 [re, im], 2 [d], S, C, N) of all modes k = 0..N/2.
 
-    The velocity that is 1 at node i alone is sum_k w_k/N cos(k (alpha - alpha_i)), w = 1, 2, ..., 2, 1.
+    The w that is 1 at node i alone is sum_k w_k/N cos(k (alpha - alpha_i)), w_k = 1, 2, ..., 2, 1, of a u with f_k in each mode.
     """
     N = T.shape[-1]
     if T.shape[-2] == 2:
         T = to_frame(T, frames)
     phase = carrier(tuple(range(N // 2 + 1)), N).to(T.dtype)
-    weights = mode_weights(N).to(T.dtype)[:, None] / N
+    weights = (mode_weights(N) * spectrum(N, rolloff)).to(T.dtype)[:, None] / N
     basis = torch.stack([torch.cos(phase) * weights, torch.sin(phase) * weights], dim=1)  # (K, 2 [re, im], N [i])
     n = len(T)
     flat = T.movedim(3, 1).reshape(n * 2, basis.shape[0] * 2, -1)  # (n d, K re/im, S C N)
@@ -135,7 +150,7 @@ def mode_weights(N: int) -> Tensor:
     return w
 
 
-def modes_of_kernel(A: Tensor, frames: Tensor) -> Tensor:
+def modes_of_kernel(A: Tensor, frames: Tensor, rolloff: float | None = None) -> Tensor:
     """D_k (n, K, 2 [re, im], 2 [d], S, C, N) of A (n, 2 [a], N [i], S, C, N): to compare both forms mode by mode."""
     n, _, N = A.shape[:3]
     F = frames.to(A.dtype)[:, :, :, :, None, None, None]
@@ -145,7 +160,7 @@ def modes_of_kernel(A: Tensor, frames: Tensor) -> Tensor:
     re = torch.einsum("ki,ndif->nkdf", torch.cos(phase), flat).reshape(n, -1, 2, *A.shape[3:])
     im = torch.einsum("ki,ndif->nkdf", torch.sin(phase), flat).reshape(re.shape)
     c, s = torch.cos(phase)[:, None, None, None, :], torch.sin(phase)[:, None, None, None, :]
-    return torch.stack([re * c + im * s, im * c - re * s], dim=2)
+    return torch.stack([re * c + im * s, im * c - re * s], dim=2) / spectrum(N, rolloff).to(A)[:, None, None, None, None, None]
 
 
 def apply_modes(D: Tensor, u: Tensor) -> Tensor:
@@ -159,8 +174,8 @@ def apply_modes(D: Tensor, u: Tensor) -> Tensor:
     return (D * both[..., None, None, :]).sum(dim=(1, 2, 3))
 
 
-def apply_kernel(A: Tensor, u: Tensor, frames: Tensor) -> Tensor:
+def apply_kernel(A: Tensor, u: Tensor, frames: Tensor, rolloff: float | None = None) -> Tensor:
     """A (M, 2, N, S, C, N) on u (M, 2 [x, y], N): (M, S, C, N)."""
     M = len(A)
-    parts = to_frame(u, frames).to(A.dtype).reshape(M, 1, -1)
+    parts = to_frame(roughened(u, rolloff), frames).to(A.dtype).reshape(M, 1, -1)
     return torch.bmm(parts, A.reshape(M, parts.shape[-1], -1)).reshape(M, *A.shape[3:])

@@ -56,11 +56,16 @@ def settings_of(config: Training, job: Job, points: int) -> Settings:
     """Of a job's network. Raises ValueError."""
     n = config.network
     common: dict[str, Any] = {"blocks": n.blocks, "width": n.width}
+    rolloff = None
     if n.arch == "ivnet":
+        if n.rolloff is not None:
+            raise ValueError(f'network.rolloff = {n.rolloff:g} is not for network.arch = "ivnet": each mode has a network of its own')
         if points % 2**n.levels:
             raise ValueError(f"network.levels = {n.levels}: {points} nodes cannot be halved so often")
         common |= {"levels": n.levels, "growth": n.growth, "activation": n.activation, "norm": n.norm}
-    return Settings(job.map, n.arch, points, tuple(n.channels), job.modes if n.arch == "ivnet" else (), common)
+    elif n.rolloff is not None and TARGETS[job.map].operator:
+        rolloff = n.rolloff
+    return Settings(job.map, n.arch, points, tuple(n.channels), job.modes if n.arch == "ivnet" else (), common, rolloff=rolloff)
 
 
 def train(config: Training, job: Job, pairs: Pairs, *, device: str = "cpu", progress: bool = True, stop_after: int | None = None) -> Path:

@@ -116,7 +116,8 @@ def operators(rung: Rung, slot: str, X: Tensor) -> Tensor:
     assert isinstance(rung.maps, LearnedMaps)
     part = rung.maps.loaded[slot][0]
     A = part.network(X)
-    D = A if part.card.network.arch == "ivnet" else modes_of_kernel(A[:, 0], frame(X))
+    settings = part.card.network
+    D = A if settings.arch == "ivnet" else modes_of_kernel(A[:, 0], frame(X), settings.rolloff)
     return D if part.card.base_points is None else D + _exact_operators(slot, X, part.card.base_points)
 
 

@@ -113,13 +113,14 @@ def test_the_parts_of_outputs(name):
     assert len({tuple(row) for row in CHARACTERS.tolist()}) == 4
 
 
+@pytest.mark.parametrize("rolloff", [None, 5.0])
 @pytest.mark.parametrize("name", OPERATORS)
-def test_operators_by_their_rows_act_as_the_whole_kernel(name):
-    network = drawn(settings_for(name))
+def test_operators_by_their_rows_act_as_the_whole_kernel(name, rolloff):
+    network = drawn(replace(settings_for(name), rolloff=rolloff))
     X = curves()
     u, F = torch.from_numpy(smooth_field(len(X), seed=3)), frame(X)
     u += torch.randn(u.shape, generator=torch.Generator().manual_seed(0), dtype=u.dtype)  # all modes, of no symmetry
-    expected = apply_kernel(network(X)[:, 0], u, F)
+    expected = apply_kernel(network(X)[:, 0], u, F, rolloff)
     operators = network.operators(X)
     assert operators.shape[:3] == (len(X), 4, 2 * (N // 4 + 1))  # little more than a quarter of the sources
     assert relative(network.apply_to(operators, u, F), expected) < 1e-5

@@ -84,11 +84,20 @@ def test_the_kernel_is_the_answer_to_one_node_at_a_time(name):
     close(kernel_of_modes(T, F), tensor(kernel_labels(name, X.numpy(), 64)))
 
 
+@pytest.mark.parametrize("rolloff", [None, 3.0])
 @pytest.mark.parametrize("name", OPERATORS)
-def test_one_form_gives_the_other(name):
+def test_one_form_gives_the_other(name, rolloff):
     _, T, F = case(name)
-    A = kernel_of_modes(T, F)
-    close(modes_of_kernel(A, F), all_modes(T, F), scale=A.abs().sum(2).max())  # sums over the nodes
+    A = kernel_of_modes(T, F, rolloff)
+    scale = A.abs().sum(2).max() * (1.0 if rolloff is None else 1.0 + (N / 2 / rolloff) ** 2)  # sums over the nodes
+    close(modes_of_kernel(A, F, rolloff), all_modes(T, F), scale=scale)
+
+
+def test_a_rolloff_takes_from_kernels_what_is_rough():
+    _, T, F = case("advection")
+    smooth, rough = (modes_of_kernel(kernel_of_modes(T, F, 3.0), F)[:, k].norm() / all_modes(T, F)[:, k].norm() for k in (1, 12))
+    assert abs(smooth / 0.9 - 1.0) < 1e-4
+    assert abs(rough * 17.0 - 1.0) < 1e-4
 
 
 @pytest.mark.parametrize("name", OPERATORS)
@@ -98,7 +107,8 @@ def test_both_forms_applied_to_a_velocity_are_the_exact_map(name):
     u = np.random.default_rng(0).normal(size=X.shape)
     expected = tensor(in_frame(apply_exact(name, ExactMaps(points=64), X.numpy(), u), X.numpy()))
     close(apply_modes(all_modes(T, F), tensor(u)), expected, 5 * SINGLE)
-    close(apply_kernel(kernel_of_modes(T, F), tensor(u), F), expected, 5 * SINGLE)
+    for rolloff in (None, 4.0):
+        close(apply_kernel(kernel_of_modes(T, F, rolloff), tensor(u), F, rolloff), expected, 30 * SINGLE if rolloff else 5 * SINGLE)
 
 
 @pytest.mark.parametrize("name", ["advection", "flow_tension"])
