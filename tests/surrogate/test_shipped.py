@@ -7,7 +7,7 @@ from surrogate_cases import mild, smooth_field
 from biem.membrane.maps import SLOTS, ExactMaps
 from surrogate.library import KINDS, SHIPPED, find, kind_of, load_maps
 
-SLOTS_OF = {"ivnet": {"relax", "self_tension"}, "mlp": set(SLOTS), "hybrid": set(SLOTS) - {"near"}}
+SLOTS_OF = {"ivnet": set(SLOTS), "mlp": set(SLOTS), "hybrid": set(SLOTS) - {"near"}}
 BOUNDS = {"ivnet": 0.05, "mlp": 0.03, "hybrid": 0.01}  # relative L2 of each map, smooth shapes and velocities
 
 
