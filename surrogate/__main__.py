@@ -135,7 +135,7 @@ def grid_command(
     with one_line_errors(ranks):
         settings = ranks.together(lambda: load_training(config, overrides or []))
         pairs = ranks.on_root(lambda: [open_pairs(path) for path in data])
-        chosen = variants(settings, blocks, widths, levels)
+        chosen = variants(settings.of(name), blocks, widths, levels)
         works = [(pick(one, pairs, output / label, name, mode), one) for label, one in chosen.items()]
         k, parts = _share(ranks, part)
         for jobs, one in works[k - 1 :: parts]:

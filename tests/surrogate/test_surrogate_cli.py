@@ -101,10 +101,11 @@ def test_wrong_input_is_one_line(pairs_path, tmp_path, monkeypatch, arguments, m
 
 def test_the_grid_prints_a_table_and_goes_on(pairs_path, tmp_path):
     options = ["grid", "--data", pairs_path, "--map", "self_tension", "-o", tmp_path, "--blocks", "1", "--widths", "4,8", "--levels", "1"]
-    first = call(*options, "--quiet", *QUICK)
+    own = ["--set", "map.self_tension.width=6"]  # what the training says for this map does not hold the grid's back
+    first = call(*options, "--quiet", *QUICK, *own)
     assert first.exit_code == 0, first.output
-    assert len([line for line in first.output.splitlines() if line.startswith("| 1 |")]) == 2
-    assert call(*options, "--quiet", *QUICK).output == first.output
+    assert {line[:9] for line in first.output.splitlines() if line.startswith("| 1 |")} == {"| 1 | 4 |", "| 1 | 8 |"}
+    assert call(*options, "--quiet", *QUICK, *own).output == first.output
 
 
 def test_parts_of_a_grid_share_its_variants(pairs_path, tmp_path):
