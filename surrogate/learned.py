@@ -18,7 +18,8 @@ from array_api_compat import array_namespace
 from torch import Tensor
 
 from biem.backend import Array, Latest, count, from_numpy, on_cpu, parallel_map, shares, to_numpy
-from biem.curves.curve import center_of_nodes, cross, dot, length, speed
+from biem.curves.curve import center_of_nodes, cross, curvature, dot, length, speed, tangent
+from biem.curves.fourier import derivative
 from biem.curves.pose import Pose, standardize
 from biem.errors import NumericalFailure
 from biem.membrane.maps import ExactMaps
@@ -75,7 +76,8 @@ class LearnedMaps:
         def learned(X: Array, u: Array) -> Array:
             rigid, base = rigid_motion(X, u), self._base("advection")
             v, pose = self._applied("advection", X, u - rigid)
-            return pose.vectors_back(v[:, 0]) + (rigid if base is None else base.advect(X, u))
+            v = pose.vectors_back(v[:, 0])
+            return rigid + keeping_length(X, v) if base is None else base.advect(X, u) + v
 
         return self._limited(learned, self.exact.advect, X, u)
 
@@ -220,6 +222,16 @@ def rigid_motion(X: Array, u: Array) -> Array:
     r = X - center_of_nodes(X)
     spin = xp.sum(cross(r, u), axis=-1) / xp.sum(dot(r, r), axis=-1)
     return center_of_nodes(u) + spin[:, None, None] * xp.stack([-r[:, 1], r[:, 0]], axis=1)
+
+
+def keeping_length(X: Array, v: Array) -> Array:
+    """v (M, 2, N) with so much of curvature times normal taken out that it leaves the lengths as they are, to first order in time."""
+    xp = array_namespace(X)
+    t = tangent(X)
+    n = xp.stack([t[:, 1], -t[:, 0]], axis=1)
+    bent = n * curvature(X)[:, None]
+    growth = lambda w: xp.sum(dot(t, derivative(w)), axis=-1)
+    return v - bent * (growth(v) / growth(bent))[:, None, None]
 
 
 def composition(dt: float, known: list[float]) -> tuple[list[int], float]:
