@@ -17,7 +17,7 @@ Channel = Literal["x", "y", "normal_x", "normal_y", "speed", "curvature", "curva
 class NetworkTable(Table):
     """arch: "ivnet", one network a mode, or "mlp", one for all modes. target: "residual" is against exact maps at base_points nodes.
 
-    rolloff: errors of an operator in mode k count as 1/(1 + (k/rolloff)^2), as the velocities that it will act on have them; of "mlp".
+    rolloff: errors of advection and flow tension in mode k count as 1/(1 + (k/rolloff)^2), as velocities have them; of "mlp" alone.
     """
 
     arch: Literal["ivnet", "mlp"] = "mlp"

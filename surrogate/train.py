@@ -63,7 +63,7 @@ def settings_of(config: Training, job: Job, points: int) -> Settings:
         if points % 2**n.levels:
             raise ValueError(f"network.levels = {n.levels}: {points} nodes cannot be halved so often")
         common |= {"levels": n.levels, "growth": n.growth, "activation": n.activation, "norm": n.norm}
-    elif n.rolloff is not None and TARGETS[job.map].operator:
+    elif job.map in ("advection", "flow_tension"):  # the forces of near layers are rough
         rolloff = n.rolloff
     return Settings(job.map, n.arch, points, tuple(n.channels), job.modes if n.arch == "ivnet" else (), common, rolloff=rolloff)
 
