@@ -105,12 +105,11 @@ def draw(trajectories: dict[str, Trajectory], distances: dict[str, tuple[np.ndar
     left.set(xlabel=f"time, {unit}", ylabel=f"distance of centroids from {next(iter(trajectories))}, R")
     left.grid(alpha=0.3)
     left.legend()
-    for index, (name, trajectory) in enumerate(trajectories.items()):
+    for index, trajectory in enumerate(trajectories.values()):
         fine = resample(trajectory.X[-1], 256)
-        for m, outline in enumerate(np.concatenate([fine, fine[..., :1]], axis=-1)):
-            right.plot(*outline, color=f"C{index - 1}" if index else "black", lw=2.5 if not index else 1.0, label=name if m == 0 else None)
-    right.set(aspect="equal", title="membranes at the end")
-    right.legend(fontsize="small")
+        for outline in np.concatenate([fine, fine[..., :1]], axis=-1):
+            right.plot(*outline, color=f"C{index - 1}" if index else "black", lw=2.5 if not index else 1.0)
+    right.set(aspect="equal", title=f"membranes at the end; black: {next(iter(trajectories))}")
     figure.savefig(path, dpi=130)
 
 

@@ -103,6 +103,7 @@ def evaluate(options: Options) -> Report:
         results["relaxation"] = session.relaxation()
     if "cost" in wanted:
         results["cost"] = session.cost()
+        results["relaxations"] = {f"relax {flow.dt:g}": session.relaxations(flow.dt) for flow in flows}
     results["notes"] = session.notes
     text = markdown(results)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -226,6 +227,10 @@ class _Session:
 
         wanted, bound = self.parts.arrays(f"relaxation {dt:g} reference", inputs, make)
         return wanted, bound
+
+    def relaxations(self, dt: float) -> dict[str, int]:
+        """By rung, its own steps in one of dt."""
+        return {rung.name: rung.relaxations(dt) for rung in self.rungs if "relax" in rung.slots and rung.knows(dt)}
 
     def cost(self) -> Results:
         """By number of vesicles and rung, exact maps and their corrections also in single precision."""

@@ -44,6 +44,12 @@ class Rung:
             return False
         return composition(dt, [part.card.dt or 0.0 for part in self.maps.loaded["relax"]])[1] == 0.0
 
+    def relaxations(self, dt: float) -> int:
+        """How many of its own steps make one of dt."""
+        if not isinstance(self.maps, LearnedMaps):
+            return 1
+        return sum(composition(dt, [part.card.dt or 0.0 for part in self.maps.loaded["relax"]])[0])
+
 
 @dataclass(frozen=True)
 class SteppedMaps(ExactMaps):

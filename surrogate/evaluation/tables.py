@@ -102,8 +102,9 @@ def trade(results: Results) -> list[tuple[str, str, str, float, dict[str, float]
             quantities.append((title, "near", {rung: f["all"] for rung, f in found.items()}))
     rows = []
     for quantity, column, found in quantities:
+        times = results.get("relaxations", {}).get(quantity, {})
         for rung, errors in found.items():
-            costs = {name: values[column] for name, values in cost.items() if values[column] is not None}
+            costs = {name: values[column] * times.get(name, 1) for name, values in cost.items() if values[column] is not None}
             if errors["median"] is not None:
                 rows.append((quantity, column, rung, float(errors["median"]), costs))
     return rows

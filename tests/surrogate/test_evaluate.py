@@ -264,7 +264,11 @@ def test_the_report_has_every_part_and_says_what_is_missing(options):
     assert {"errors_test.png", "errors_test_advection.png", "velocities.png", "relaxation_1e-05.png", "cost.png"} <= {
         p.name for p in report.files
     }
-    assert {row[2] for row in trade(results) if row[0].startswith("relax 1e-05")} >= {"mlp", "exact 48, extrapolated"}
+    rows = trade(results)
+    assert {row[2] for row in rows if row[0].startswith("relax 1e-05")} >= {"mlp", "exact 48, extrapolated"}
+    once, composed = (next(row[4] for row in rows if row[0] == f"relax {dt}") for dt in ("1e-05", "0.0001"))
+    assert composed["mlp"] == 10 * once["mlp"]
+    assert composed["exact 48"] == once["exact 48"]
 
 
 def test_only_what_has_changed_is_measured_again(options, monkeypatch):
