@@ -17,7 +17,7 @@ from surrogate import train as module
 from surrogate.config import load_training
 from surrogate.pairs import open_pairs
 from surrogate.targets import TARGETS
-from surrogate.train import Job, read_log, train
+from surrogate.train import Job, read_log, settings_of, train
 from surrogate.weights import read_checkpoint, read_weights, save_weights
 
 IVNET = ["network.arch=ivnet", "network.blocks=1", "network.width=8"]
@@ -345,3 +345,11 @@ def test_what_a_run_was_stands_beside_it(tmp_path, pairs):
 def test_the_training_files_are_valid(path):
     config = load_training(path)
     assert {config.of(name).network.arch for name in TARGETS} == {config.network.arch}
+
+
+def test_a_rolloff_is_of_what_acts_on_velocities():
+    config = config_of(*MLP, "network.rolloff=4")
+    found = {name: settings_of(config, Job(name, (), Path("runs")), 32).rolloff for name in TARGETS}
+    assert found == {"relax": None, "self_tension": None, "advection": 4.0, "flow_tension": 4.0, "near": None}
+    with pytest.raises(ValueError, match="rolloff = 4"):
+        settings_of(config_of(*IVNET, "network.rolloff=4"), Job("near", (0,), Path("runs")), 32)
