@@ -11,9 +11,9 @@ from scipy import optimize
 from scipy.spatial import cKDTree
 
 from biem.curves.crossing import polygons
-from biem.curves.curve import area
 from biem.curves.shapes import place
 
+CORNERS, CORNERS_OF_MANY, MANY = 512, 128, 200  # of the polygons that are moved; those of more than MANY vesicles have fewer
 MOVES = 60  # accepted or not, of each vesicle
 MOST_MOVES = 2000
 LARGEST_TURN = 1.5  # rad
@@ -56,13 +56,14 @@ def random_packing(
     M = len(shapes)
     width = np.asarray(box, dtype=np.float64)
     radius = float(np.sqrt((shapes**2).sum(axis=1)).max())
-    one = float(np.mean(area(shapes)))
+    claimed = float(np.mean(shapely.area(shapely.buffer(polygons(shapes), 0.5 * gap))))  # no two may meet in this
     where, room_area = f"the box of {box[0]:g} x {box[1]:g}", float(width.prod())
     if region is not None:
         where, room_area = "the fluid between the walls", float(region.area)
-    if M * one > room_area:
+    if M * claimed > room_area:
         raise ValueError(
-            f"{M} vesicles do not fit: they cover {M * one:.3g}, {where} has {room_area:.3g}: fewer than {int(room_area / one)} can fit"
+            f"{M} vesicles do not fit: with half of the gap of {gap:g} around each they cover {M * claimed:.3g}, {where} has "
+            f"{room_area:.3g}: at most {int(room_area / claimed)} can fit; lower count, area_fraction or gap"
         )
     slots, pitch = _slots(M, width) if region is None else _slots_in(M, width, region, gap)
     centers = slots[rng.permutation(len(slots))[:M]]
@@ -73,7 +74,8 @@ def random_packing(
     if size[0] <= 0:
         raise ValueError(f"{M} vesicles with gaps of {gap:g} do not fit into a box of {box[0]:g} x {box[1]:g}: enlarge it or lower gap")
 
-    outline = np.stack([np.asarray(p.exterior.coords.xy) for p in polygons(shapes)])
+    corners_each = CORNERS if M <= MANY else CORNERS_OF_MANY
+    outline = np.stack([np.asarray(p.exterior.coords.xy) for p in polygons(shapes, max(1, corners_each // shapes.shape[2]))])
     cell = 2.0 * radius + gap
     moved = np.zeros(M, dtype=int)
 

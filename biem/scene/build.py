@@ -21,6 +21,7 @@ from biem.stokes.walls import Walls
 MOST_STEPS = 1e12
 LARGEST_SHRINKAGE = 1000.0  # of adaptive steps, from the first one
 LEAST_TOLERANCE = 1e-9  # of adaptive steps
+PLACED_AT = 128  # nodes of the outlines that are placed, so that vesicles are where they are at any resolution
 WALL_NODES_PER_LENGTH = 32  # on walls, by default, per membrane length
 SOLVERS_WITH = {  # keys of [solver] that not every kind takes
     "device": ("split", "vesnet"),
@@ -164,32 +165,34 @@ def _membranes(scene: Scene, region: shapely.Polygon | None) -> np.ndarray:
         return assemble(shapes, centers, angles)
     if v.centers is not None or v.angles is not None:
         raise ValueError('vesicles.centers and angles go with placement = "explicit"')
-    one = float(area(single[None])[0])
+    fine = v.model_copy(update={"points": PLACED_AT})
+    outline = _shape(fine, np.random.default_rng(v.seed))
+    one = float(area(outline[None])[0])
     if region is not None and v.placement == "random" and v.box is None:
-        return _packed(v, single, one, region)
+        return _packed(v, single, outline, one, region)
     count, box = _count_and_box(v, one)
-    shapes = _shapes(v, single, count)
+    shapes, outlines = _shapes(v, single, count), _shapes(fine, outline, count)
     gap = v.gap * v.length
     if v.placement == "grid":
-        centers, angles = grid(shapes, box, gap)
+        centers, angles = grid(outlines, box, gap)
     else:
-        centers, angles = random_packing(shapes, box, gap, np.random.default_rng([v.seed, 1]))
+        centers, angles = random_packing(outlines, box, gap, np.random.default_rng([v.seed, 1]))
     corner = (-box[0] / 2, -box[1] / 2) if v.corner is None else v.corner
     return assemble(shapes, centers + np.asarray(corner), angles)
 
 
-def _packed(v: Vesicles, single: np.ndarray, one: float, region: shapely.Polygon) -> np.ndarray:
-    """Random positions all over the fluid between walls."""
+def _packed(v: Vesicles, single: np.ndarray, outline: np.ndarray, one: float, region: shapely.Polygon) -> np.ndarray:
+    """Random positions all over the fluid between walls. outline: the single shape on PLACED_AT nodes, of area `one`."""
     if (v.count is None) == (v.area_fraction is None):
         raise ValueError('vesicles: placement = "random" between walls needs count or area_fraction (of the fluid), one of them')
     if v.corner is not None:
         raise ValueError("vesicles.corner goes with a box")
     count = v.count or max(1, round((v.area_fraction or 0.0) * region.area / one))
-    shapes = _shapes(v, single, count)
+    shapes, outlines = _shapes(v, single, count), _shapes(v.model_copy(update={"points": PLACED_AT}), outline, count)
     x0, y0, x1, y1 = region.bounds
     moved = shapely.transform(region, lambda p: p - (x0, y0))
     rng = np.random.default_rng([v.seed, 1])
-    centers, angles = random_packing(shapes, (x1 - x0, y1 - y0), v.gap * v.length, rng, moved)
+    centers, angles = random_packing(outlines, (x1 - x0, y1 - y0), v.gap * v.length, rng, moved)
     return assemble(shapes, centers + np.array([x0, y0]), angles)
 
 

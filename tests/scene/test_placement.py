@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scene_helpers import scene_of
 
-from biem.curves.curve import area, length
+from biem.curves.curve import area, centroid, length
 from biem.scene.build import build
+from biem.scene.config import make_scene
 from biem.stokes.near_search import minimum_gap
 
 
@@ -63,3 +64,22 @@ def test_placements_that_cannot_be_are_refused():
             placed(**keys)
     with pytest.raises(ValueError, match=r"solver\.operator_points = 16 is below vesicles\.points = 32"):
         build(scene_of(vesicles={"points": 32}, solver={"operator_points": 16}))
+
+
+HOW = [{"box": [2.0, 2.0], "count": 9}, {"area_fraction": 0.3, "count": 9}, {"area_fraction": 0.2, "box": [2.0, 1.5]}]
+
+
+@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize("shape", ["equilibrium", "perturbed"])
+@pytest.mark.parametrize("placement", ["random", "grid"])
+def test_vesicles_are_where_they_are_at_any_resolution(how, shape, placement):
+    X = [build(scene_of(vesicles={**how, "placement": placement, "shape": shape, "points": N})).X for N in (32, 48, 96)]
+    for other in X[1:]:
+        np.testing.assert_allclose(centroid(other), centroid(X[0]), atol=1e-4)  # 32 nodes hold the shape to that
+
+
+def test_between_walls_too():
+    walls, time = {"kind": "circle", "radius": 1.0, "omega": 1.0}, {"dt": 1.0, "horizon": 1.0}
+    vesicles = lambda N: {"placement": "random", "count": 4, "points": N}
+    X = [build(make_scene({"name": "walled", "vesicles": vesicles(N), "walls": walls, "time": time})).X for N in (32, 64)]
+    np.testing.assert_allclose(centroid(X[0]), centroid(X[1]), atol=1e-4)
