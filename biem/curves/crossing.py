@@ -1,4 +1,7 @@
-"""Crossing membranes: polygons of the refined curves tested by shapely, candidates confirmed on finer polygons. X: (M, 2, N)."""
+"""Crossing membranes: polygons of the refined curves tested by shapely, candidates confirmed on finer polygons. X: (M, 2, N).
+
+Curves that come closer than their chords cut off are candidates too: a crossing as shallow as 1e-6 lengths (N = 32) is found.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,10 @@ import numpy as np
 import shapely
 
 from biem.backend import Array, to_numpy
-from biem.curves.fourier import resample
+from biem.curves.fourier import derivative, resample
 
 COARSE, FINE = 4, 32  # polygon corners per node: first test, confirmation
+NEIGHBOURS = 3  # nodes of a side of a curve that are close to each other
 
 
 def polygons(X: Array, refinement: int = COARSE) -> np.ndarray:
@@ -21,8 +25,9 @@ def polygons(X: Array, refinement: int = COARSE) -> np.ndarray:
 
 def self_crossings(X: Array, shapes: np.ndarray | None = None) -> list[int]:
     """Indices of curves that cross themselves. shapes: polygons(X) where they are at hand."""
-    suspect = np.flatnonzero(~shapely.is_valid(polygons(X) if shapes is None else shapes))
-    return [int(i) for i in suspect if not shapely.is_valid(polygons(to_numpy(X)[[i]], FINE)[0])]
+    X = to_numpy(X)
+    suspect = np.flatnonzero(~shapely.is_valid(polygons(X) if shapes is None else shapes) | _narrow(X))
+    return [int(i) for i in suspect if not shapely.is_valid(polygons(X[[i]], FINE)[0])]
 
 
 def pair_crossings(X: Array, shapes: np.ndarray | None = None) -> list[tuple[int, int]]:
@@ -31,11 +36,29 @@ def pair_crossings(X: Array, shapes: np.ndarray | None = None) -> list[tuple[int
     if X.shape[0] < 2:
         return []
     shapes = polygons(X) if shapes is None else shapes
-    i, j = shapely.STRtree(shapes).query(shapes)  # boxes that meet; to prepare polygons for so few tests each would not pay
+    cut = _cut(X)
+    boxes = shapely.box(*(shapely.bounds(shapes) + cut[:, None] * np.array([-1.0, -1.0, 1.0, 1.0])).T)
+    i, j = shapely.STRtree(boxes).query(boxes)  # boxes that meet; to prepare polygons for so few tests each would not pay
     i, j = i[i < j], j[i < j]
-    meet = shapely.intersects(shapes[i], shapes[j])
+    meet = shapely.dwithin(shapes[i], shapes[j], cut[i] + cut[j])
     pairs = zip(i[meet].tolist(), j[meet].tolist(), strict=True)
     return [(a, b) for a, b in pairs if shapely.intersects(*polygons(X[[a, b]], FINE))]
+
+
+def _cut(X: np.ndarray) -> np.ndarray:
+    """How far curves may run outside their polygons (M,), at most: twice what chords cut off by the second derivatives at the nodes."""
+    X_aa = derivative(derivative(X))
+    return 0.25 * np.hypot(X_aa[:, 0], X_aa[:, 1]).max(axis=-1) * (2.0 * np.pi / (COARSE * X.shape[-1])) ** 2
+
+
+def _narrow(X: np.ndarray) -> np.ndarray:
+    """Whether two sides of a curve may meet between corners of its polygon (M,): nodes no neighbours, no farther apart than neighbours."""
+    spacing = np.hypot(*np.moveaxis(X - np.roll(X, 1, axis=-1), 1, 0)).max(axis=-1)
+    reach = (spacing + 2.0 * _cut(X))[:, None]
+    narrow = np.zeros(X.shape[0], dtype=bool)
+    for lag in range(NEIGHBOURS + 1, X.shape[-1] // 2 + 1):
+        narrow |= (np.hypot(*np.moveaxis(X - np.roll(X, lag, axis=-1), 1, 0)) < reach).any(axis=-1)
+    return narrow
 
 
 def fluid_region(curves: Sequence[np.ndarray]) -> shapely.Polygon:

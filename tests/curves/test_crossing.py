@@ -21,7 +21,7 @@ def tangent_circles(gap, angle):
 
 
 @pytest.mark.parametrize("angle", [0.0, np.pi / 32, np.pi / 100])
-@pytest.mark.parametrize("depth", [0.5, 1e-2, 1e-3])
+@pytest.mark.parametrize("depth", [0.5, 1e-2, 1e-3, 1e-4, 2e-5])
 def test_overlapping_curves_are_found(depth, angle):
     first, last = tangent_circles(-depth, angle)
     X = np.stack([first, circle(32, center=(9.0, 0.0)), last])
@@ -30,7 +30,7 @@ def test_overlapping_curves_are_found(depth, angle):
 
 
 @pytest.mark.parametrize("angle", [0.0, np.pi / 32])
-@pytest.mark.parametrize("gap", [0.5, 1e-2, 1e-3])
+@pytest.mark.parametrize("gap", [0.5, 1e-2, 1e-3, 1e-5])
 def test_close_curves_are_not(gap, angle):
     assert pair_crossings(np.stack(tangent_circles(gap, angle))) == []
 
@@ -76,6 +76,15 @@ def test_a_figure_eight_among_others_does_not_disturb_the_pairs():
 @pytest.mark.parametrize(("neck", "found"), [(1e-3, []), (-1e-3, [0])])
 def test_a_closing_neck(neck, found):
     assert self_crossings(dumbbell(128, neck)[None]) == found
+
+
+@pytest.mark.parametrize("shift", [0.0, np.pi / 128, np.pi / 300])
+@pytest.mark.parametrize(("neck", "found"), [(1e-4, []), (-1e-4, [0])])
+def test_a_neck_that_closes_between_corners(neck, found, shift):
+    """The sides bulge towards each other: their polygons are up to 1e-3 farther apart than they."""
+    t = nodes(32) + shift
+    X = np.stack([np.cos(t), np.sin(t) * (0.5 * neck + 0.4 * np.cos(t) ** 2)])
+    assert self_crossings(X[None]) == found
 
 
 def test_slender_vesicles_do_not_cross_themselves_and_stack_closely():
