@@ -2,7 +2,8 @@
 
     X~ = X + lambda_1 n + lambda_2 c n     (n: gradient of the area, -c n: of the length)     with area(X~) = A_0, length(X~) = L_0
 
-Both directions are taken at X; two equations in (lambda_1, lambda_2) per vesicle are solved by Newton's method, batched.
+Both directions are taken at X; two equations in (lambda_1, lambda_2) per vesicle are solved by Newton's method, batched. Where A_0 and
+L_0 leave next to no other shape than the circle, c n cannot take all modes away at once: there the second direction leads to the circle.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from biem.errors import NumericalFailure
 
 TOLERANCE = 1e-10  # relative, of area and of length
 MAX_ITERATIONS = 60
+NEARLY_A_CIRCLE = 1e-3  # 1 - 4 pi A_0/L_0^2
 SINGULAR = 1e-12  # |det J| over |J|^2 below which J counts as of rank one
 
 
@@ -32,7 +34,9 @@ def restore_area_length(X: Array, area_0: Array, length_0: Array, first: int = 0
     if changed == 0:
         return X, 0
     n = remove_nyquist(normal(X))
-    directions = [n, remove_nyquist((curvature(X) * length_0[:, None] / (2 * xp.pi))[:, None, :] * n)]
+    bent = (curvature(X) * length_0[:, None] / (2 * xp.pi))[:, None, :] * n
+    nearly = 1.0 - 4.0 * xp.pi * area_0 / length_0**2 < NEARLY_A_CIRCLE
+    directions = [n, remove_nyquist(xp.where(nearly[:, None, None], _to_circle(X, length_0), bent))]
     Y = X
     for _ in range(MAX_ITERATIONS):
         J = xp.stack([_derivatives(Y, d, area_0, length_0) for d in directions], axis=-1)
@@ -47,6 +51,13 @@ def restore_area_length(X: Array, area_0: Array, length_0: Array, first: int = 0
         f"area and length of vesicle {first + worst} could not be restored: relative errors {float(off[worst, 0]):.1e}, "
         f"{float(off[worst, 1]):.1e} after {MAX_ITERATIONS} iterations; use smaller steps"
     )
+
+
+def _to_circle(X: Array, length_0: Array) -> Array:
+    """From X (M, 2, N) to the circles of that length about the means of the nodes, along their radii."""
+    xp = array_namespace(X)
+    r = X - center_of_nodes(X)
+    return r * (length_0[:, None] / (2 * xp.pi) / xp.sqrt(dot(r, r)) - 1.0)[:, None, :]
 
 
 def _least_squares(J: Array, b: Array) -> Array:

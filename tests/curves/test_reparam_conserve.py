@@ -134,6 +134,20 @@ def test_circles_and_near_circles_where_the_two_gradients_are_parallel(excess):
     assert np.abs(Z[0] - X).max() < 1e-9
 
 
+@pytest.mark.parametrize("deficit", [0.0, 1e-9, 1e-5])
+def test_a_circle_bent_by_many_modes_is_restored(deficit):
+    """No displacement along n and c n alone takes the modes away together."""
+    t, R = nodes(32), 1 / (2 * np.pi)
+    r = R * (1 + 5e-3 * np.cos(2 * t + 0.4) + 2e-3 * np.cos(3 * t) + 1e-3 * np.sin(5 * t))
+    X = (np.stack([r * np.cos(t), r * np.sin(t)]) + np.array([[3.0], [-2.0]]))[None]
+    area_0, length_0 = np.array([(1 - deficit) * np.pi * R**2]), np.ones(1)
+    Z, changed = restore_area_length(X, area_0, length_0)
+    assert changed == 1
+    assert np.abs(curve.area(Z) / area_0 - 1).max() < 1e-10
+    assert np.abs(curve.length(Z) - 1).max() < 1e-10
+    assert np.abs(Z - X).max() < 1.2 * np.abs(r - R).max()
+
+
 def test_more_area_than_the_length_can_hold_raises_and_names_the_vesicle():
     Y, area_0, length_0 = bent()
     area_0[2] = 1.01 * length_0[2] ** 2 / (4 * np.pi)

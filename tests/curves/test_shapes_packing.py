@@ -145,3 +145,16 @@ def test_random_packing_that_does_not_fit_raises(monkeypatch, count, gap):
     shapes = np.stack([ellipse(32, 0.8)] * count)
     with pytest.raises(ValueError, match=f"{count} vesicles"):
         packing.random_packing(shapes, (0.6, 0.6), gap, np.random.default_rng(0))
+
+
+def test_vesicles_that_would_fit_but_for_their_gaps_are_refused_at_once(monkeypatch):
+    """Of the area that 20 cover, 1.03, 1.15 is there; with half of a gap around each it is 1.24."""
+    shapes = np.repeat(equilibrium(32, 0.65)[None], 20, axis=0)
+    side = float(np.sqrt(curve.area(shapes).sum() / 0.9))
+    monkeypatch.setattr(packing, "MOST_MOVES", 0)  # none is made
+    with pytest.raises(ValueError, match=r"they cover 1\.24, the box .* has 1\.15: at most 18 can fit"):
+        packing.random_packing(shapes, (side, side), 0.02, np.random.default_rng(0))
+    circles = np.repeat(ellipse(32, 1.0)[None], 16, axis=0)
+    width = 4 * (np.ptp(circles[0, 0]) + 0.05)  # a grid of them does fit
+    with pytest.raises(ValueError, match="no random packing"):
+        packing.random_packing(circles, (width, width), 0.05, np.random.default_rng(0))
