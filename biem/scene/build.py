@@ -19,6 +19,8 @@ from biem.scene.walls import make_walls
 from biem.stokes.walls import Walls
 
 MOST_STEPS = 1e12
+FARTHEST = 1e8  # from the origin, over the size of the largest vesicle: beyond, nodes keep fewer than eight digits of a shape
+CIRCLE = 1e-6  # 1 - reduced area below which a vesicle counts as a circle
 LARGEST_SHRINKAGE = 1000.0  # of adaptive steps, from the first one
 LEAST_TOLERANCE = 1e-9  # of adaptive steps
 PLACED_AT = 128  # nodes of the outlines that are placed, so that vesicles are where they are at any resolution
@@ -81,6 +83,8 @@ def build(scene: Scene) -> Problem:
         flow = _flow(scene, radius)
         if flow.kind == "rotation":
             _check_rotation(X)
+    if flow.kind != "quiescent" or len(X) > 1 or walls is not None:
+        _check_not_circles(X)
     t_kappa = scene.physics.mu * radius**3 / scene.physics.kappa_b
     units = {"t_gamma": flow.time_scale, "t_kappa": t_kappa}
     dt, dt_min, horizon = _times(scene, units)
@@ -273,6 +277,12 @@ def _from_file(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
 
 
 def _check_membranes(X: np.ndarray, region: shapely.Polygon | None) -> None:
+    away = np.abs(X.mean(axis=-1)).max(axis=-1) / np.ptp(X, axis=-1).max()
+    if away.max() > FARTHEST:
+        raise ValueError(
+            f"vesicle {int(away.argmax())} is {away.max():.3g} times its size from the origin, where positions have lost too many digits: "
+            f"move the scene to within {FARTHEST:g}"
+        )
     crossed = self_crossings(X)
     if crossed:
         raise ValueError(f"vesicle {crossed[0]} crosses itself ({len(crossed)} in all do): give simple closed curves")
@@ -288,6 +298,15 @@ def _check_membranes(X: np.ndarray, region: shapely.Polygon | None) -> None:
     if len(bad):
         raise ValueError(
             f"vesicle {bad[0]} has reduced area {nu[bad[0]]:.6g}: expected a value in (0, 1]; its nodes do not resolve a curve"
+        )
+
+
+def _check_not_circles(X: np.ndarray) -> None:
+    circles = np.flatnonzero(reduced_area(X) > 1.0 - CIRCLE)
+    if len(circles):
+        raise ValueError(
+            f"vesicle {circles[0]} is a circle ({len(circles)} in all are): a constant tension moves nothing on it, so that its tension is "
+            f"not determined; take a reduced area of at most {1.0 - 10 * CIRCLE:g}"
         )
 
 

@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from scene_helpers import scene_of, table
+from scene_helpers import PAIR, scene_of, table
 
 from biem.curves.curve import area
 from biem.run.simulate import simulate
@@ -116,3 +116,16 @@ def test_a_trajectory_of_a_killed_run_gives_its_last_frame_too(tmp_path):
 def test_a_file_excludes_keys_about_shapes():
     with pytest.raises(ValueError, match=r"vesicles\.file excludes vesicles\.points"):
         build(make_scene({**table(), "vesicles": {"file": "x.h5", "points": 32}}))
+
+
+@pytest.mark.parametrize("changes", [{}, PAIR, {"flow": {"kind": "quiescent", "rate": None}, **PAIR}])
+def test_circles_that_something_moves_are_refused(changes):
+    with pytest.raises(ValueError, match=r"vesicle 0 is a circle .* take a reduced area of at most 0\.99999"):
+        build(scene_of(changes, vesicles={**changes.get("vesicles", {}), "reduced_area": 1.0}))
+
+
+def test_nearly_a_circle_is_none_and_a_circle_may_rest():
+    assert len(build(scene_of(PAIR, vesicles={**PAIR["vesicles"], "reduced_area": 0.99999, "centers": [[-0.5, 0.0], [0.5, 0.0]]})).X) == 2
+    still = {"flow": {"kind": "quiescent", "rate": None}}
+    run = simulate(scene_of(still, vesicles={"reduced_area": 1.0}))
+    assert np.abs(run.trajectory.X[-1] - run.trajectory.X[0]).max() < 1e-10

@@ -83,3 +83,9 @@ def test_between_walls_too():
     vesicles = lambda N: {"placement": "random", "count": 4, "points": N}
     X = [build(make_scene({"name": "walled", "vesicles": vesicles(N), "walls": walls, "time": time})).X for N in (32, 64)]
     np.testing.assert_allclose(centroid(X[0]), centroid(X[1]), atol=1e-4)
+
+
+def test_a_place_too_far_for_the_digits_of_a_shape_is_refused():
+    assert placed(centers=[[1e6, 0.0]]).shape == (1, 2, 32)
+    with pytest.raises(ValueError, match=r"vesicle 1 is .* times its size from the origin"):
+        placed(centers=[[0.0, 0.0], [1e10, 0.0]])
