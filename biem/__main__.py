@@ -19,6 +19,7 @@ from biem.ranks import Ranks, world
 from biem.run.simulate import simulate
 from biem.run.solver import make_stepper, on_device
 from biem.run.trajectory import Trajectory, read_trajectory
+from biem.scene.accuracy import describe
 from biem.scene.build import Problem, build
 from biem.scene.config import Scene, load_scene
 from biem.scene.plan import memory_estimate, required_parts, trajectory_bytes
@@ -32,6 +33,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 ScenePath = Annotated[Path, typer.Argument(help="Scene file (TOML).", metavar="SCENE", show_default=False)]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="Override a key: --set vesicles.points=32.", metavar="KEY=VALUE")]
 SolverName = Annotated[str | None, typer.Option("--solver", help="Override solver.kind.")]
+AccuracyName = Annotated[str | None, typer.Option("--accuracy", help="A preset for the scene's: fast, balanced or reference.")]
 WeightsFolder = Annotated[Path | None, typer.Option("--weights", help="Override solver.weights: a folder.", metavar="DIR")]
 TrajectoryPath = Annotated[Path, typer.Argument(help="Trajectory (HDF5).", metavar="TRAJECTORY", show_default=False)]
 
@@ -44,6 +46,7 @@ def run(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside the output.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an output that exists.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+    accuracy: AccuracyName = None,
     weights: WeightsFolder = None,
     overrides: Overrides = None,
 ) -> None:
@@ -51,7 +54,7 @@ def run(
     with one_line_errors():
         ranks = world()
     with one_line_errors(ranks):
-        loaded = ranks.together(lambda: _load(scene, solver, weights, overrides))
+        loaded = ranks.together(lambda: _load(scene, solver, accuracy, weights, overrides))
         path = output or Path(loaded.output.trajectory or f"out/{loaded.name}.h5")
         notices = ranks.on_root(lambda: build(loaded).notices if loaded.vesicles.file else ())
         for notice in notices if ranks.rank == 0 else ():
@@ -66,17 +69,20 @@ def plan(
     scene: ScenePath,
     solver: SolverName = None,
     measure: Annotated[bool, typer.Option(help="Time two steps for the estimate.")] = True,
+    accuracy: AccuracyName = None,
     weights: WeightsFolder = None,
     overrides: Overrides = None,
 ) -> None:
     """Print what a scene requires, and why, with memory, file size and time."""
     first_rank_only()
     with one_line_errors():
-        problem = build(_load(scene, solver, weights, overrides))
+        problem = build(_load(scene, solver, accuracy, weights, overrides))
         M, _, N = problem.X.shape
         adaptive = problem.scene.time.adaptive
         steps = "adaptive steps, their number not known, the first one of" if adaptive else f"{problem.steps} steps of"
         typer.echo(f"{problem.scene.name}: {M} vesicle(s) of {N} nodes, {steps} dt = {problem.dt:.6g}{_in_flow_times(problem)}")
+        for line in describe(problem.scene.model_dump()):
+            typer.echo(line)
         parts = required_parts(problem)
         wide = max(len(p.name) for p in parts)
         for part in parts:
@@ -122,13 +128,13 @@ def verify(trajectory: TrajectoryPath) -> None:
             fail(f"{failed} of {len(checks)} checks failed on {trajectory}", 3)
 
 
-def _load(path: Path, solver: str | None, weights: Path | None, overrides: list[str] | None) -> Scene:
+def _load(path: Path, solver: str | None, accuracy: str | None, weights: Path | None, overrides: list[str] | None) -> Scene:
     settings = list(overrides or [])
     if solver:
         settings.append(f'solver.kind="{solver}"')
     if weights is not None:
         settings.append(f"solver.weights={json.dumps(str(weights.absolute()), ensure_ascii=False)}")
-    return load_scene(path, settings)
+    return load_scene(path, settings, accuracy)
 
 
 def _in_flow_times(problem: Problem) -> str:

@@ -159,7 +159,7 @@ def run_command(
 ) -> None:
     """Run a scene by VesNet: `python -m biem run --solver vesnet`."""
     chosen = [*(overrides or []), *([f'solver.maps="{maps}"'] if maps else [])]
-    biem_cli.run(scene, output, "vesnet", resume, force, quiet, weights, chosen)
+    biem_cli.run(scene, output, "vesnet", resume, force, quiet, weights=weights, overrides=chosen)
 
 
 def _overrides(arch: str | None, target: str | None, overrides: list[str] | None) -> list[str]:

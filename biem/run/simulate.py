@@ -36,6 +36,7 @@ from biem.stokes.near_search import minimum_gap
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 WORST = ("area_error", "length_error", "gmres_iterations", "error_estimate")  # diagnostics of a frame: the largest since the last one
+Enough = Callable[[float, np.ndarray], bool]
 REJECTED = (NumericalFailure, ValueError)  # ValueError: the flow refused a point or a time
 
 
@@ -60,17 +61,20 @@ def simulate(
     force: bool = False,
     progress: bool = False,
     ranks: Ranks = ALONE,
+    enough: Enough | None = None,
 ) -> Run:
     """Runs a scene to its horizon; with `output`, into that HDF5 file, with checkpoints beside it.
 
+    enough: called with t and X (M, 2, N) of every frame that is saved; the run ends early where it says True.
     ranks: the processes that share the work (`biem.ranks.world()` under mpirun); the first one writes, the others get the last frame
     back from a run into a file. Raises ValueError for input that is wrong (before anything is touched), NumericalFailure for a rejected
     step (the last good state is in the trajectory and the checkpoint), Stopped after a signal, OSError where the output cannot be written.
     """
-    return ranks.together(lambda: _simulate(scene, None if output is None else Path(output), resume, force, progress, ranks))
+    path = None if output is None else Path(output)
+    return ranks.together(lambda: _simulate(scene, path, resume, force, progress, ranks, enough))
 
 
-def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progress: bool, ranks: Ranks) -> Run:
+def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progress: bool, ranks: Ranks, enough: Enough | None) -> Run:
     resolved = json.dumps(scene.model_dump(mode="json"))
     found = ranks.on_root(lambda: where_to_resume(path, resolved, resume, force))
     problem = ranks.together(lambda: build(scene))
@@ -97,7 +101,7 @@ def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progre
     files = Output(problem, path, start, attributes, earlier, resume, ranks)
     with counting() as counts, fft_backend(problem.X.size):
         counts.update(start.counts)
-        loop = _Loop(problem, stepper, start, int(earlier.step[-1]), files, counts, progress and ranks.rank == 0, ranks)
+        loop = _Loop(problem, stepper, start, int(earlier.step[-1]), files, counts, progress and ranks.rank == 0, ranks, enough)
         loop.run()
     files.close()
     return Run(files.trajectory() or _frame(problem, loop.step, loop.state, {}), path, counts)
@@ -116,6 +120,7 @@ class _Loop:
         counts: Counter[str],
         progress: bool,
         ranks: Ranks,
+        enough: Enough | None,
     ) -> None:
         self.problem = problem
         self.stepper = stepper
@@ -125,6 +130,7 @@ class _Loop:
         self.files = files
         self.counts = counts
         self.progress = progress
+        self.enough = enough
         self.step = start.step
         self.state = start.state
         self.running = dict(start.running)
@@ -157,6 +163,7 @@ class _Loop:
                 last = self._done()
                 if self.step % every == 0 or last:
                     self._save_frame()
+                    last = last or (self.enough is not None and self.ranks.any(self.enough(self.state.t, to_numpy(self.state.X))))
                 stopping = self.ranks.any(stop()) and not last
                 if (self.step % checkpoint_every == 0 or last or stopping) and not self.shortened:
                     self._checkpoint()
@@ -166,6 +173,8 @@ class _Loop:
                     self.files.close()
                     where = f"of {self.problem.steps}" if self.controller is None else f"at t = {self.state.t:.6g}"
                     raise Stopped(f"stopped at step {self.step} {where}; go on with --resume")
+                if last:
+                    return
 
     def _done(self) -> bool:
         return self.step >= self.problem.steps if self.controller is None else self.state.t >= self.problem.horizon

@@ -10,7 +10,8 @@ from typing import Any, Literal, get_args
 from pydantic import Field, PrivateAttr, field_validator
 
 from biem.membrane.maps import SLOTS
-from biem.scene.tables import Table, read_toml, validated
+from biem.scene.accuracy import apply_accuracy
+from biem.scene.tables import Table, override, read_toml, validated
 
 Kind = Literal["quiescent", "shear", "extensional", "poiseuille", "taylor_green", "rotation", "custom"]
 MapKind = Literal["ivnet", "mlp", "hybrid", "exact"]
@@ -145,6 +146,7 @@ class Solver(Table):
     """
 
     kind: Literal["implicit", "split", "vesnet"] = "implicit"
+    accuracy: Literal["fast", "balanced", "reference"] | None = None  # settings of biem.scene.accuracy for what the scene leaves open
     device: str = Field("cpu", pattern=r"^(cpu|torch|cuda(:\d+)?)$")  # split; "cpu": NumPy, "torch": PyTorch on the CPU, "cuda", "cuda:1"
     dtype: Literal["float64", "float32"] = "float64"  # split; of kernels, solves and pair sums: geometry and forces are float64
     maps: MapsTable = Field(MapsTable.of_all("hybrid"))  # vesnet; one kind for all, or a table by map: those not named are exact
@@ -214,17 +216,23 @@ class Scene(Table):
         return self._folder
 
 
-def load_scene(path: str | Path, overrides: Iterable[str] = ()) -> Scene:
-    """The scene in a TOML file, with overrides such as "vesicles.points=32". Raises ValueError with one line for what is wrong."""
+def load_scene(path: str | Path, overrides: Iterable[str] = (), accuracy: str | None = None) -> Scene:
+    """The scene in a TOML file, with overrides such as "vesicles.points=32". accuracy: a preset in place of what the file says, beneath
+    the overrides. Raises ValueError with one line for what is wrong.
+    """
     path = Path(path)
-    table = read_toml(path, "scene", "configs/scenes/shear_pair.toml", overrides)
+    table = read_toml(path, "scene", "configs/scenes/shear_pair.toml")
+    if accuracy is not None:
+        table = apply_accuracy(table, accuracy)
+    for text in overrides:
+        override(table, text)
     table.setdefault("name", path.stem)
     return make_scene(table, path.parent)
 
 
 def make_scene(table: dict[str, Any], folder: str | Path = ".") -> Scene:
     """The scene of a dictionary in the layout of the file. Raises ValueError with one line for what is wrong."""
-    scene = validated(Scene, table, EXPECTED)
+    scene = validated(Scene, apply_accuracy(table), EXPECTED)
     scene._folder = Path(folder)
     return scene
 

@@ -64,6 +64,7 @@ REFUSED = {
     "time.tolerance": '0 | -1e-3 | 1.0 | nan | "1e-3 t_gamma"',
     "time.dt_min": '0 | -1e-6 | inf | true | [1] | "1e-4 furlongs" | ""',
     "solver.kind": '"exact"',
+    "solver.accuracy": '"best" | 3 | true',
     "solver.tolerance": "0 | 1",
     "solver.max_iterations": "0",
     "solver.operator_points": "8 | 33",
