@@ -239,8 +239,8 @@ class _Run:
         save_weights(path, network, card)
         draw_curve(self.folder)
 
-    def _least_damping(self, network: LearnedMap, card: Card) -> int | None:
-        def relax(choice: int | None) -> Relax:
+    def _least_damping(self, network: LearnedMap, card: Card) -> int:
+        def relax(choice: int) -> Relax:
             part = Loaded(network.requires_grad_(False), card.model_copy(update={"damped_from": choice}))
             return LearnedMaps({"relax": (part,)}).relax
 

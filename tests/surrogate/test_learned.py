@@ -135,14 +135,14 @@ def test_damping_leaves_low_modes_alone():
             assert (out[..., first:] - change * torch.fft.rfft(X)[..., first:]).abs().max() < 1e-12
 
 
-@pytest.mark.parametrize(("stable_from", "choice"), [(99, None), (14, 13), (0, 11)])
+@pytest.mark.parametrize(("stable_from", "choice"), [(99, 15), (14, 13), (0, 11)])
 def test_as_much_damping_as_stability_takes_and_no_more(stable_from, choice):
     """A relaxation that makes its undamped modes from `stable_from` on grow a little, step by step."""
 
     def relax(damped_from):
         def step(X, dt):
             z = np.fft.rfft(X)
-            high = slice(min(stable_from, 16), min(damped_from or 16, 16))
+            high = slice(min(stable_from, 16), min(damped_from, 16))
             z[..., high] = 1.5 * z[..., high] + 1e-4
             return np.fft.irfft(z, n=X.shape[-1])
 
