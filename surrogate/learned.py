@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
-from math import pi
+from functools import cached_property, partial
+from math import isfinite, pi
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,10 +25,11 @@ from biem.curves.pose import Pose, standardize
 from biem.errors import NumericalFailure
 from biem.membrane.maps import ExactMaps
 from surrogate.damping import damped
+from surrogate.distribution import Distribution
 from surrogate.features import frame
 from surrogate.networks import LearnedMap
 from surrogate.targets import from_frame
-from surrogate.weights import Card
+from surrogate.weights import Card, read_distribution, read_weights
 
 CPU_CHUNK, DEVICE_CHUNK = 128, 4096  # vesicles at a time: their operators stay in the cache, in the memory
 SAME_DT = 1e-2  # relative difference of time steps that counts as none: lengths of membranes vary by less than a third of it
@@ -42,6 +44,39 @@ class Loaded:
     network: LearnedMap
     card: Card
     base: ExactMaps | None = None
+
+    @property
+    def distribution(self) -> Distribution:
+        return self.network.distribution
+
+
+@dataclass(frozen=True)
+class Deferred:
+    """A `Loaded` whose network is read at its first use, and counted as "MAP_networks_loaded". card: what its file said before."""
+
+    path: Path
+    card: Card
+    base: ExactMaps | None = None
+
+    @cached_property
+    def network(self) -> LearnedMap:
+        """Raises OSError for a file that is not what it was, or whose values are not finite: what no time step mends."""
+        count(f"{self.card.network.map}_networks_loaded")
+        try:
+            network, card = read_weights(self.path)
+        except ValueError as error:
+            raise OSError(str(error)) from None
+        if card != self.card:
+            raise OSError(f"{self.path} is not the file that the run began with: restore it, and go on with --resume")
+        return network
+
+    @cached_property
+    def distribution(self) -> Distribution:
+        """Of the training shapes, read without the network."""
+        return read_distribution(self.path)
+
+
+Part = Loaded | Deferred
 
 
 @dataclass(frozen=True)
@@ -61,7 +96,7 @@ class LearnedMaps:
     A map whose slot is not loaded, other than near, raises KeyError.
     """
 
-    loaded: Mapping[str, tuple[Loaded, ...]]
+    loaded: Mapping[str, tuple[Part, ...]]
     kappa_b: float = 1.0
     mu: float = 1.0
     exact: ExactMaps = field(default_factory=ExactMaps)
@@ -112,7 +147,7 @@ class LearnedMaps:
             part = self._part("self_tension")
             standard = self._standardized(X)
             count("self_tension_network", X.shape[0])
-            sigma = _back(part.network(standard.X)[:, 0, 0], X)
+            sigma = _back(_at(part.network, standard.X)(standard.X)[:, 0, 0], X)
             back = standard.pose.scalars_back(sigma) * (self.kappa_b / standard.pose.scale**2)[:, None]
             return _plus(back, part.base, lambda base: base.self_tension(X))
 
@@ -121,6 +156,8 @@ class LearnedMaps:
     def relax(self, X: Array, dt: float) -> Array:
         """X_next (M, 2, N) after dt: the steps that networks know, and the rest by exact maps."""
         scaled = dt * self.kappa_b / (self.mu * float(array_namespace(X).mean(length(X))) ** 3)
+        if not isfinite(scaled):
+            return X + float("nan")  # as exact maps answer to what is not finite: it is the guard's to reject
         steps, rest = composition(scaled, [part.card.dt or 0.0 for part in self.loaded["relax"]])
         for part, times in zip(self.loaded["relax"], steps, strict=True):
             each = dt * (part.card.dt or 0.0) / scaled
@@ -137,10 +174,10 @@ class LearnedMaps:
         outside = float(np.sum(self._is_outside(X)))
         return {"out_of_distribution": outside, "by_exact_maps": outside if self.limits == "exact" else 0.0}
 
-    def _relaxed(self, X: Array, part: Loaded, dt: float) -> Array:
+    def _relaxed(self, X: Array, part: Part, dt: float) -> Array:
         standard = self._standardized(X)
         count("relax_network", X.shape[0])
-        increments = from_frame(part.network(standard.X)[:, 0].double(), standard.frames)
+        increments = from_frame(_at(part.network, standard.X)(standard.X)[:, 0].double(), standard.frames)
         if part.base is not None:
             scale = standard.pose.scale[:, None, None]
             return part.base.relax(X, dt) + standard.pose.vectors_back(_back(increments, X)) * scale
@@ -151,18 +188,18 @@ class LearnedMaps:
     def _applied(self, slot: str, X: Array, u: Array) -> tuple[Array, Pose]:
         """The network's answer (M, S, C, N) to u, in the standard frame, and the pose."""
         standard = self._standardized(X)
-        part = self._part(slot)
+        network = _at(self._part(slot).network, standard.X)
         u_std = _tensor(standard.pose.vectors(u))
 
         def make() -> Tensor:
             count(f"{slot}_network", X.shape[0])
-            return _chunked(lambda chunk: part.network.operators(standard.X[chunk]), standard.X)
+            return _chunked(lambda chunk: network.operators(standard.X[chunk]), standard.X)
 
         operators = self._operator.setdefault(slot, Latest()).of(X, make)
 
         def at(chunk: slice) -> Tensor:
             frames = standard.frames[chunk]
-            v = part.network.apply_to(operators[chunk], u_std[chunk], frames)
+            v = network.apply_to(operators[chunk], u_std[chunk], frames)
             return from_frame(v.double(), frames) if v.shape[2] == 2 else v.double()
 
         return _back(_chunked(at, standard.X), X), standard.pose
@@ -171,15 +208,11 @@ class LearnedMaps:
         def make() -> Standard:
             X_std, pose = standardize(X)
             tensor = _tensor(X_std)
-            for parts in self.loaded.values():
-                for part in parts:
-                    if part.network.distribution.center.device != tensor.device:
-                        part.network.to(tensor.device)
             return Standard(tensor, frame(tensor), pose)
 
         return self._standard.of(X, make)
 
-    def _part(self, slot: str) -> Loaded:
+    def _part(self, slot: str) -> Part:
         return self.loaded[slot][0]
 
     def _base(self, slot: str) -> ExactMaps | None:
@@ -189,8 +222,8 @@ class LearnedMaps:
         """(M,) bool, by the statistics of the first map loaded."""
 
         def make() -> np.ndarray:
-            distribution = next(iter(self.loaded.values()))[0].network.distribution
             X_std = self._standardized(X).X
+            distribution = next(iter(self.loaded.values()))[0].distribution.to(X_std.device)
             outside = (distribution(X_std) > distribution.limit).cpu().numpy()
             if self.limits == "refuse" and outside.any():
                 raise NumericalFailure(
@@ -249,6 +282,11 @@ def _chunked(function: Callable[[slice], Tensor], like: Tensor) -> Tensor:
     chunks = shares(0, M, 16, CPU_CHUNK) if on_cpu(like) else [slice(i, i + DEVICE_CHUNK) for i in range(0, M, DEVICE_CHUNK)]
     parts = parallel_map(function, chunks) if on_cpu(like) else [function(chunk) for chunk in chunks]
     return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _at(network: LearnedMap, X: Tensor) -> LearnedMap:
+    """The network on the device of X."""
+    return network if network.distribution.center.device == X.device else network.to(X.device)
 
 
 def _tensor(a: Array) -> Tensor:

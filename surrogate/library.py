@@ -16,13 +16,14 @@ import numpy as np
 
 from biem.curves.curve import area, length
 from biem.membrane.maps import SLOTS, ExactMaps
-from surrogate.learned import SAME_DT, LearnedMaps, Loaded, composition
+from surrogate.learned import SAME_DT, Deferred, LearnedMaps, Loaded, Part, composition
 from surrogate.targets import TARGETS
-from surrogate.weights import Card, read_card, read_weights
+from surrogate.weights import Card, check_weights, read_card, read_weights
 
 SHIPPED = Path(__file__).parent / "shipped"
 KINDS = ("ivnet", "mlp", "hybrid")
 SAME_REDUCED_AREA = 5e-3
+ON_DEMAND = ("near",)  # slots that a run may never call: their networks are read when it does
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,9 @@ def load_maps(
     """Maps of the shipped weights, or of those in a folder (or file). kind: "ivnet", "mlp" or "hybrid".
 
     need: what they must be for (default: reduced area 0.65, 32 nodes, any time step); slots: those to load (default all that the kind has).
-    A slot that "hybrid" has no network for, near, is answered by exact maps. Raises FileNotFoundError, ValueError for weights that are
-    missing, or are not for what is needed.
+    A slot that "hybrid" has no network for, near, is answered by exact maps; other networks of near are read at the first call of
+    `near_layers`, their cards, names and shapes now. Raises FileNotFoundError, ValueError for weights that are missing, or are not for
+    what is needed.
     """
     if kind not in KINDS:
         raise ValueError(f"there are no maps of kind {kind!r}: expected one of {', '.join(KINDS)}")
@@ -97,7 +99,7 @@ def _card_of(path: Path, changed: int) -> Card:
     return read_card(path)
 
 
-def _load(kind: str, slot: str, folder: Path, need: Need, base: Callable[[int], ExactMaps]) -> tuple[Loaded, ...]:
+def _load(kind: str, slot: str, folder: Path, need: Need, base: Callable[[int], ExactMaps]) -> tuple[Part, ...]:
     cards = [(path, card) for path, card in find(folder) if kind_of(card) == kind and card.network.map == slot]
     if not cards:
         raise ValueError(f"{folder} has no weights of {slot} for solver.maps = {kind!r}: train them, or choose other maps")
@@ -110,6 +112,8 @@ def _load(kind: str, slot: str, folder: Path, need: Need, base: Callable[[int], 
             raise ValueError(f"{folder} has several weights of {slot} ({kind}) that fit, such as {path.name} and {other.name}: leave one")
     if slot == "relax":
         _check_steps([card for _, card in fitting], need)
+    if slot in ON_DEMAND:
+        return tuple(_deferred(path, card, base) for path, card in fitting)
     return tuple(_read(path, base) for path, _ in fitting)
 
 
@@ -144,3 +148,8 @@ def _check_steps(cards: list[Card], need: Need) -> None:
 def _read(path: Path, base: Callable[[int], ExactMaps]) -> Loaded:
     network, card = read_weights(path)
     return Loaded(network, card, None if card.base_points is None else base(card.base_points))
+
+
+def _deferred(path: Path, card: Card, base: Callable[[int], ExactMaps]) -> Deferred:
+    check_weights(path)
+    return Deferred(path, card, None if card.base_points is None else base(card.base_points))

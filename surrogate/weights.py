@@ -21,9 +21,11 @@ from safetensors.torch import save
 from biem.membrane.maps import LAYERS
 from biem.run.files import one_line, write_atomically
 from biem.scene.tables import Table, validated
+from surrogate.distribution import Distribution
 from surrogate.networks import LearnedMap, Settings, make_network
 
 VERSION = 1
+STATISTICS = "distribution."  # of the training shapes: what their tensors' names begin with
 HALVED = ("core.", "basis")  # tensors that may be kept in half precision: the statistics are not
 
 
@@ -87,23 +89,54 @@ def read_weights(path: Path) -> tuple[LearnedMap, Card]:
     with _opened(path) as file:
         card = _card(path, file.metadata())
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a dictionary)
+    network = _network_of(path, card, {name: tuple(value.shape) for name, value in tensors.items()})
+    _check_values(path, tensors)
+    expected = network.state_dict()
+    network.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})
+    return network.eval().requires_grad_(False), card
+
+
+def check_weights(path: Path) -> None:
+    """Raises what `read_weights` would, but for values that are not finite: the tensors are not read, only their names and shapes."""
+    with _opened(path) as file:
+        card = _card(path, file.metadata())
+        shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+    _network_of(path, card, shapes)
+
+
+def read_distribution(path: Path) -> Distribution:
+    """The statistics of the shapes that the network was trained on, without the network. Raises as `read_weights`."""
+    with _opened(path) as file:
+        card = _card(path, file.metadata())
+        tensors = {name: file.get_tensor(name) for name in file.keys() if name.startswith(STATISTICS)}  # noqa: SIM118
+    _check_values(path, tensors)
+    distribution = Distribution(card.network.points)
+    distribution.load_state_dict({name.removeprefix(STATISTICS): value for name, value in tensors.items()})
+    return distribution
+
+
+def _network_of(path: Path, card: Card, shapes: Mapping[str, tuple[int, ...]]) -> LearnedMap:
+    """The network of a card, its weights not yet set. Raises ValueError where it has other tensors than those of these shapes."""
     try:
         network = make_network(card.network)
     except (TypeError, KeyError, ValueError) as error:
         raise ValueError(f"{path}: its card does not describe a network that there is: {one_line(error)}") from None
     expected = network.state_dict()
-    missing, unknown = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+    missing, unknown = sorted(expected.keys() - shapes.keys()), sorted(shapes.keys() - expected.keys())
     if missing or unknown:
         what = f"has no tensor {missing[0]}" if missing else f"has a tensor {unknown[0]} that the network of its card has not"
         raise ValueError(f"{path} {what} (and {len(missing) + len(unknown) - 1} more): take the file as training wrote it")
+    for name, shape in shapes.items():
+        if shape != tuple(expected[name].shape):
+            raise ValueError(f"{path}: {name} has shape {shape}, its card expects {tuple(expected[name].shape)}")
+    return network
+
+
+def _check_values(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
     for name, value in tensors.items():
-        if value.shape != expected[name].shape:
-            raise ValueError(f"{path}: {name} has shape {tuple(value.shape)}, its card expects {tuple(expected[name].shape)}")
         unbounded = name.endswith(("lowest", "highest", "limit"))
         if not bool((~torch.isnan(value) if unbounded else torch.isfinite(value)).all()):
             raise ValueError(f"{path}: {name} has values that are not finite")
-    network.load_state_dict({name: value.to(expected[name].dtype) for name, value in tensors.items()})
-    return network.eval().requires_grad_(False), card
 
 
 def _opened(path: Path) -> Any:

@@ -83,6 +83,7 @@ def required_maps(problem: Problem) -> list[Part]:
     near = "one vesicle"
     if many or walled:
         near = f'solver.near_field = "{solver.near_field}"' + (f", that is {_near_name(solver)}" if solver.near_field == "auto" else "")
+        near += f", on demand: where a membrane is within {max(LAYERS):g} h of another" if solver.near_method in METHODS else ""
     return [
         Part("relax", True, "bending is implicit"),
         Part("self_tension", tension, f"tension by bending: {wanted}"),

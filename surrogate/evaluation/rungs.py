@@ -18,7 +18,7 @@ from biem.stokes.near import accurate_rows
 from biem.stokes.near_search import locate
 from surrogate.base import exact_labels
 from surrogate.features import frame
-from surrogate.learned import LearnedMaps, Loaded, composition
+from surrogate.learned import LearnedMaps, Part, composition
 from surrogate.library import SHIPPED, Need, find, kind_of, load_maps
 from surrogate.targets import TARGETS, carrier, demodulated, modes_of_kernel
 
@@ -87,7 +87,7 @@ def learned_rungs(kinds: Sequence[str], weights: Path | None, need: Need, exact:
     folder = weights or SHIPPED
     rungs, notes = [], []
     for kind in kinds:
-        loaded: dict[str, tuple[Loaded, ...]] = {}
+        loaded: dict[str, tuple[Part, ...]] = {}
         digests: dict[str, str] = {}
         maps = None
         for slot in SLOTS:
