@@ -22,7 +22,7 @@ demo: $(READY)
 	$(BIN)/python -m biem plot out/demo/shear_pair.h5 -o out/demo/shear_pair
 	$(BIN)/python -m biem run configs/scenes/poiseuille_100.toml -o out/demo/poiseuille_100.h5 --force
 	$(BIN)/python -m biem plot out/demo/poiseuille_100.h5 -o out/demo/poiseuille_100
-	OMP_NUM_THREADS=1 $(BIN)/python scripts/ladder.py configs/scenes/vesnet_pair.toml -o out/demo/ladder --set "time.horizon=10 t_gamma"
+	$(BIN)/python scripts/compare.py configs/scenes/vesnet_pair.toml -o out/demo/compare --set "time.horizon=10 t_gamma"
 	$(BIN)/python -m datagen make configs/datagen/smoke.toml -o out/demo/data
 
 dataset: $(READY)
