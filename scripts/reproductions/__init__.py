@@ -1,0 +1,1 @@
+"""The paper's experiments, one file each: `measure(study)` runs or collects and returns results, `section(results)` says them in words."""
