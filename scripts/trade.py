@@ -6,7 +6,7 @@ python scripts/trade.py configs/scenes/shear_pair.toml --solvers "split[time.ord
 python scripts/trade.py --page docs/trade.md                                    # of all scenes in out/trade, and their presets
 
 A rung of --solvers may name several values of a key, with | between them: all combinations are run. Without --solvers the sweeps of SWEEPS.
-Writes trade.json, trade.md and trade.png into out/trade/SCENE; runs that are there are kept, so that a second call adds to them.
+Writes trade.json, trade.md and trade.png of these rungs into out/trade/SCENE; runs that are there are kept.
 The error is the largest distance of a centroid from the reference, in R; of a lone vesicle at rest that of its shape. The cost is CPU
 seconds of one thread per t_gamma (per t_kappa in a fluid at rest), without compilation and start.
 """
@@ -72,10 +72,10 @@ def combinations(text: str) -> list[str]:
     return [f"{s}[{', '.join(own)}]" if own else s for s, *own in itertools.product(solvers, *choices)]
 
 
-def with_frames(found: Rung) -> Rung:
-    """The rung with about FRAMES frames in its run."""
+def with_frames(found: Rung, every: int | None = None) -> Rung:
+    """The rung with a frame every so many steps; default: about FRAMES frames in its run."""
     problem = build(found.scene)
-    every = max(1, problem.steps // FRAMES)
+    every = every or max(1, problem.steps // FRAMES)
     scene = found.scene.model_copy(
         update={
             "time": found.scene.time.model_copy(update={"save_every": every}),
@@ -204,7 +204,7 @@ def main() -> None:
     folder = chosen.output / base.scene.name
     tasks = {r.name: (r.scene, folder / "runs" / f"{r.file}.h5") for r in rungs}
     if not stored:
-        first = with_frames(base)
+        first = with_frames(base, 1 if base.scene.time.adaptive else None)  # it is interpolated to the others' times
         tasks = {first.name: (first.scene, folder / "runs" / f"{first.file}.h5"), **tasks}
     runs = kept_all(tasks, chosen.workers)
     reference = read_trajectory(Path(chosen.reference)) if stored else runs[base.name].trajectory
