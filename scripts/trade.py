@@ -199,6 +199,7 @@ def main() -> None:
         names = [name for sweep in sweeps for name in combinations(sweep.format(u="t_gamma" if unit == "t_gamma" else "t_kappa"))]
         rungs = [with_frames(rung(chosen.scene, name, overrides)) for name in dict.fromkeys(names)]
         problem = build(base.scene)
+        found = read_trajectory(Path(chosen.reference)) if stored else None
     except (ValueError, FileNotFoundError) as error:
         raise SystemExit(f"error: {error}") from None
     folder = chosen.output / base.scene.name
@@ -207,7 +208,7 @@ def main() -> None:
         first = with_frames(base, 1 if base.scene.time.adaptive else None)  # it is interpolated to the others' times
         tasks = {first.name: (first.scene, folder / "runs" / f"{first.file}.h5"), **tasks}
     runs = kept_all(tasks, chosen.workers)
-    reference = read_trajectory(Path(chosen.reference)) if stored else runs[base.name].trajectory
+    reference = found or runs[base.name].trajectory
     measure = "shape" if len(problem.X) == 1 and problem.flow.kind == "quiescent" else "position"
     rows = [row(name, run, reference, measure, value, problem.horizon) for name, run in runs.items()]
     text = table(rows, unit, measure)
