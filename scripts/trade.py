@@ -8,7 +8,7 @@ python scripts/trade.py --page docs/trade.md                                    
 A rung of --solvers may name several values of a key, with | between them: all combinations are run. Without --solvers the sweeps of SWEEPS.
 Writes trade.json, trade.md and trade.png of these rungs into out/trade/SCENE; runs that are there are kept.
 The error is the largest distance of a centroid from the reference, in R; of a lone vesicle at rest that of its shape. The cost is CPU
-seconds of one thread per t_gamma (per t_kappa in a fluid at rest), without compilation and start.
+seconds of one thread per t_gamma (per t_kappa in a fluid at rest), without compilation, start and output.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ INTRODUCTION = """# What accuracy costs
 
 Made by `python scripts/trade.py --page docs/trade.md` from sweeps of `python scripts/trade.py SCENE`. Errors are the largest distance of a
 centroid from the reference over the time given, in R, the radius of the circle of a vesicle's area; of a lone vesicle at rest that of its
-shape. Costs are CPU seconds of one thread per t_gamma (t_kappa in a fluid at rest). A star marks the Pareto front: nothing is cheaper and
-as accurate.
+shape. Costs are CPU seconds of one thread per t_gamma (t_kappa in a fluid at rest), without output. A star marks the Pareto front: nothing
+is cheaper and as accurate.
 
 ## Presets
 """
@@ -96,7 +96,7 @@ def row(name: str, run: Kept, reference: Trajectory, measure: str, unit: float, 
     per = record.steps * unit / record.until
     return found | {
         "error": largest[measure],
-        "cost": record.cpu_a_step * per,
+        "cost": (record.cpu_a_step - record.seconds.get("output", 0.0)) * per,
         "wall": record.wall_a_step * per,
         "megabytes": record.peak_bytes / 1e6,
         "differences": largest,

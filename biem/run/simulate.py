@@ -18,7 +18,7 @@ from uuid import uuid4
 import numpy as np
 from tqdm import tqdm
 
-from biem.backend import count, counting, fft_backend, to_numpy
+from biem.backend import count, counting, fft_backend, stage, to_numpy
 from biem.curves.curve import area, bending_energy, length
 from biem.errors import NumericalFailure
 from biem.ranks import ALONE, Ranks
@@ -242,7 +242,8 @@ class _Loop:
         r["dt"] = dt
 
     def _save_frame(self) -> None:
-        self.files.frame(lambda: _frame(self.problem, self.step, self.state, self.running))
+        with stage("output"):
+            self.files.frame(lambda: _frame(self.problem, self.step, self.state, self.running))
         self.running = {}
         self.saved = self.step
 
@@ -255,9 +256,9 @@ class _Loop:
 
     def _checkpoint(self) -> None:
         s, control = self.start, {} if self.controller is None else self.control
-        self.files.checkpoint(
-            lambda: Checkpoint(self.step, self.state, s.area_0, s.length_0, s.scene, self.running, dict(self.counts), s.run, control)
-        )
+        make = lambda: Checkpoint(self.step, self.state, s.area_0, s.length_0, s.scene, self.running, dict(self.counts), s.run, control)
+        with stage("output"):
+            self.files.checkpoint(make)
 
     def _shown(self) -> float:
         """Where the bar stands: at a step, or at a time where the number of steps is not known."""

@@ -37,7 +37,7 @@ PRESETS = {
             "time": {"order": 2, "adaptive": True, "tolerance": 5e-4},
             "solver": {"kind": "split", "dtype": "float32", "near_tolerance": 1e-5, "far_tolerance": 1e-5},
         },
-        (0.05, 0.0125),
+        (0.02, 0.005),
         "positions within 1 % of R over 10 t_gamma for one or two vesicles, 20 to 40 times cheaper than reference; in dense suspensions, "
         "where differences grow tenfold in 3 t_gamma, within 1 % of R over 1 t_gamma, and numbers of vesicles beyond",
     ),
