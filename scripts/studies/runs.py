@@ -7,6 +7,7 @@ Beside OUT.h5 lies OUT.json: wall, CPU and stage seconds a step, peak memory, wh
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -34,6 +35,7 @@ from biem.run.trajectory import Trajectory, read_trajectory
 from biem.scene.build import build
 from biem.scene.config import Scene, make_scene
 from biem.steppers.stepper import State
+from surrogate.library import SHIPPED
 
 Ending = Callable[[Scene, Trajectory | None], Enough]  # of a scene and the frames that are there: what ends its run before the horizon
 SCRIPTS = Path(__file__).resolve().parents[1]
@@ -56,6 +58,7 @@ class Record:
     threads: int = 1
     commit: str = ""
     machine: str = ""
+    weights: str = ""  # digest of the networks' files
     code: int = 0  # of the exit that `biem run` would take: 2 bad input, 3 step rejected
     warnings: Sequence[str] = ()  # that were shown, a line each
 
@@ -133,7 +136,17 @@ def read_record(scene: Scene, path: Path) -> Record | None:
         record = Record(**json.loads(path.with_suffix(".json").read_text()))
     except (FileNotFoundError, json.JSONDecodeError, TypeError):
         return None
+    if record.weights and record.weights != weights_digest(scene):
+        return None
     return record if same_scene(record.scene, scene) and (path.exists() or record.failure) else None
+
+
+def weights_digest(scene: Scene) -> str:
+    """Of the files of the networks that a scene may take; nothing where it takes none."""
+    kinds = sorted(set(scene.solver.map_kinds.values()) - {"exact"})
+    folder = SHIPPED if scene.solver.weights is None else scene.folder / scene.solver.weights
+    files = [file for kind in kinds for file in sorted((folder / kind).glob("*.safetensors"))]
+    return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()[:16] if files else ""
 
 
 def run(scene: Scene, path: Path, ending: Ending | None = None) -> Record:
@@ -172,6 +185,7 @@ def run(scene: Scene, path: Path, ending: Ending | None = None) -> Record:
         counts=counts,
         threads=int(os.environ.get("OMP_NUM_THREADS", "0")),
         commit=commit(),
+        weights=weights_digest(scene),
         machine=f"{platform.machine()}, {os.cpu_count()} cores",
         code=code,
         warnings=[f"{warning.category.__name__}: {warning.message}" for warning in shown],

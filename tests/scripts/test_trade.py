@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import trade
 from scene_helpers import DT, PAIR, scene_of, write_scene
 from studies.pareto import front
 from studies.rungs import rung, split_list
-from studies.runs import kept, read_record, run, same_scene
+from studies.runs import Record, kept, read_record, resolved, run, same_scene, weights_digest
 from studies.steady import Steady
 
 from biem.curves.shapes import ellipse
@@ -80,6 +81,20 @@ def test_runs_are_kept_and_may_end_early(tmp_path):
     again = kept(scene, path)  # from its files: no process is started
     assert again.record == record
     assert read_record(scene_of(time={"save_every": 2}), path) is None
+
+
+def test_other_weights_are_another_run(tmp_path):
+    (tmp_path / "w" / "mlp").mkdir(parents=True)
+    file = tmp_path / "w" / "mlp" / "relax.safetensors"
+    file.write_bytes(b"one")
+    scene = scene_of(folder=tmp_path, solver={"kind": "vesnet", "maps": "mlp", "weights": "w"})
+    path = tmp_path / "a.h5"
+    record = Record(resolved(scene), "refused", weights=weights_digest(scene))
+    path.with_suffix(".json").write_text(json.dumps(asdict(record)))
+    assert read_record(scene, path).weights == record.weights != ""
+    file.write_bytes(b"two")
+    assert read_record(scene, path) is None
+    assert weights_digest(scene_of()) == ""
 
 
 def test_a_scene_from_before_a_key_is_the_same_scene():
