@@ -8,6 +8,8 @@ import h5py
 import numpy as np
 import torch
 from helpers import nodes, rotate
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from biem.curves.curve import normal
 from biem.curves.fourier import resample
@@ -226,3 +228,12 @@ def card_of(settings, **changes):
         }
         | changes
     )
+
+
+def rewritten(path, change):
+    """The file with other tensors or another card: change(tensors, card) in place."""
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        card = json.loads(file.metadata()["card"])
+    change(tensors, card)
+    save_file(tensors, path, metadata={"card": json.dumps(card)})

@@ -36,7 +36,7 @@ RUNGS = (
     "vesnet:ivnet",
 )
 FINE, POINTS, REDUCED_AREA = 128, 32, 0.65
-ROUGHNESS = {"modes": 8, "power": 0.5}  # of the shape
+MODES, POWER = 8, 0.5  # roughness of the shape
 DT, STEPS, EVERY = 1e-5, 1500, 10  # the paper's step
 SHOWN = (0, 50, 200, 1500)  # steps
 MOST_SEEDS = 200
@@ -79,12 +79,12 @@ def unlike_training() -> tuple[int, float, float]:
         distance = float(distribution(torch.from_numpy(standardize(X)[0]))[0])
         if distance > float(distribution.limit):
             return seed, distance, float(distribution.limit)
-    raise ValueError(f"none of {MOST_SEEDS} shapes is outside the training distribution: raise ROUGHNESS in {Path(__file__).name}")
+    raise ValueError(f"none of {MOST_SEEDS} shapes is outside the training distribution: raise MODES in {Path(__file__).name}")
 
 
 def rough_shape(seed: int, points: int) -> np.ndarray:
     """(1, 2, points) of length 1 and the reduced area."""
-    X = resample(perturbed(FINE, REDUCED_AREA, seed=seed, **ROUGHNESS)[None], points)  # type: ignore[arg-type]
+    X = resample(perturbed(FINE, REDUCED_AREA, seed=seed, modes=MODES, power=POWER)[None], points)
     return restore_area_length(X, np.array([REDUCED_AREA / (4.0 * np.pi)]), np.array([1.0]))[0]
 
 
@@ -171,7 +171,7 @@ def section(results: Results) -> str:
             "**The paper**: a shape outside the data set relaxes by VesNet to the right equilibrium shape, with the right bending "
             "energy along the way; "
             "N = 128, dt = 1e-5.",
-            f"**Found**: a shape (`shapes.perturbed` with {ROUGHNESS['modes']} modes, seed {results['seed']}) whose distance from the "
+            f"**Found**: a shape (`shapes.perturbed` with {MODES} modes, seed {results['seed']}) whose distance from the "
             f"training shapes, "
             f"{results['distance']:.3g}, is beyond the limit of {results['limit']:.3g} that all but one in a thousand of these keep "
             f"(`surrogate/distribution.py`). {STEPS} steps of {DT:g}; the reference is of order 2.",

@@ -1,12 +1,9 @@
 """Files of weights: whole through a round trip, and each way in which one may be bad is one line that names the file."""
 
-import json
-
 import pytest
 import torch
-from safetensors import safe_open
 from safetensors.torch import save_file
-from surrogate_cases import card_of, drawn, mild, settings_for
+from surrogate_cases import card_of, drawn, mild, rewritten, settings_for
 
 from surrogate.weights import checkpoint_bytes, read_card, read_checkpoint, read_weights, save_weights
 
@@ -18,15 +15,6 @@ def saved(path, name="relax", arch="ivnet", half=False, **changes):
     network = drawn(settings)
     save_weights(path, network, card_of(settings, **changes), half)
     return network
-
-
-def rewritten(path, change):
-    """The file with other tensors or another card: change(tensors, card) in place."""
-    with safe_open(path, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        card = json.loads(file.metadata()["card"])
-    change(tensors, card)
-    save_file(tensors, path, metadata={"card": json.dumps(card)})
 
 
 def the_error(path, read=read_weights, kind=ValueError):

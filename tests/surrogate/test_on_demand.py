@@ -1,14 +1,10 @@
 """Networks of near layers are read when a gap first needs them, and not before; what is wrong with their files is said before the run."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
 from scene_helpers import scene_of
-from surrogate_cases import card_of, drawn, mild, settings_for
+from surrogate_cases import card_of, drawn, mild, rewritten, settings_for
 
 from biem.backend import counting
 from biem.membrane.maps import SLOTS
@@ -33,15 +29,6 @@ def shelf(tmp_path):
         network.distribution.measure(torch.from_numpy(mild(24)))
         save_weights(tmp_path / f"{name}.safetensors", network, card_of(settings))
     return tmp_path
-
-
-def rewritten(path, change):
-    """The file with other tensors or another card: change(tensors, card) in place."""
-    with safe_open(path, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        card = json.loads(file.metadata()["card"])
-    change(tensors, card)
-    save_file(tensors, path, metadata={"card": json.dumps(card)})
 
 
 def test_a_near_network_is_read_once_at_the_first_call(shelf, monkeypatch):
