@@ -2,19 +2,21 @@
 
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trade
+from comparison_cases import moving
 from scene_helpers import DT, PAIR, scene_of, write_scene
 from studies.pareto import front
 from studies.rungs import rung, split_list
-from studies.runs import Record, kept, read_record, resolved, run, same_scene, weights_digest
+from studies.runs import Kept, Record, kept, read_record, resolved, run, same_scene, weights_digest
 from studies.steady import Steady
 
 from biem.curves.shapes import ellipse
+from biem.run.trajectory import read_trajectory
 from biem.scene.config import load_scene
 
 
@@ -147,3 +149,19 @@ def test_bad_input_is_one_line(monkeypatch, arguments, expected):
         trade.main()
     assert str(ended.value.code).startswith(expected)
     assert "\n" not in str(ended.value.code)
+
+
+def test_the_cost_is_without_output(tmp_path):
+    moving(tmp_path / "a.h5")
+    record = Record("", until=0.03, steps=300, cpu_a_step=0.05, seconds={"output": 0.02})
+    made = Kept(scene_of(), tmp_path / "a.h5", record)
+    found = trade.row("a", made, made.trajectory, "position", 0.01, 0.03)
+    assert found["cost"] == pytest.approx(0.03 * 100)  # 100 steps a t_gamma
+    assert found["error"] < 1e-12
+
+
+def test_where_no_centroid_moves_the_shapes_are_compared(tmp_path):
+    moving(tmp_path / "a.h5")
+    moved = read_trajectory(tmp_path / "a.h5")
+    assert trade.moves(moved)
+    assert not trade.moves(replace(moved, X=np.repeat(moved.X[:1], len(moved), axis=0)))
