@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -18,9 +19,10 @@ from functools import cache, lru_cache
 from importlib import import_module
 from typing import Any
 
+import array_api_compat.numpy
 import numpy as np
 import scipy.fft
-from array_api_compat import array_namespace, device, is_numpy_array, is_numpy_namespace, is_torch_array
+from array_api_compat import device, is_numpy_array, is_numpy_namespace, is_torch_array
 
 Array = Any  # a NumPy array or a PyTorch tensor
 
@@ -28,6 +30,8 @@ Array = Any  # a NumPy array or a PyTorch tensor
 FFTW_PAYS_ABOVE = 50_000
 
 _counts: ContextVar[Counter[str] | None] = ContextVar("counts", default=None)
+_blas_single: ContextVar[bool] = ContextVar("blas_single", default=False)
+_compiled = threading.local()  # threads that numba was told to use, of each thread
 _timing: ContextVar[tuple[dict[str, float], Callable[[], None]] | None] = ContextVar("timing", default=None)
 
 
@@ -73,6 +77,13 @@ def stage(name: str) -> Iterator[None]:
     yield
     wait()
     seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def array_namespace(*arrays: Array) -> Any:
+    """The array API of the arrays, `array_api_compat.array_namespace`, at once where all are NumPy arrays."""
+    if all(type(a) is np.ndarray for a in arrays):
+        return array_api_compat.numpy
+    return array_api_compat.array_namespace(*arrays)
 
 
 def fft_backend(size: int) -> Any:
@@ -122,7 +133,10 @@ def compiled(module: str) -> Any:
     import numba
 
     loops = import_module(module)
-    numba.set_num_threads(min(threads(), numba.config.NUMBA_NUM_THREADS))
+    wanted = min(threads(), numba.config.NUMBA_NUM_THREADS)
+    if getattr(_compiled, "threads", None) != wanted:  # to ask numba takes a lock between processes
+        numba.set_num_threads(wanted)
+        _compiled.threads = wanted
     return loops
 
 
@@ -179,14 +193,29 @@ def _blas() -> Any:
     return ThreadpoolController().select(user_api="blas")
 
 
-def one_blas_thread() -> Any:
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
     """Context with BLAS on one thread: batches of small matrices gain nothing from more, and results do not depend on their number."""
-    return _blas().limit(limits=1)
+    if _blas_single.get():
+        yield
+        return
+    with _blas_on(1):
+        yield
 
 
 def all_blas_threads() -> Any:
     """Context with BLAS on all threads, for one large matrix, also within `one_blas_thread`."""
-    return _blas().limit(limits=threads())
+    return _blas_on(threads())
+
+
+@contextmanager
+def _blas_on(number: int) -> Iterator[None]:
+    token = _blas_single.set(number == 1)
+    try:
+        with _blas().limit(limits=number):
+            yield
+    finally:
+        _blas_single.reset(token)
 
 
 def shares(start: int, stop: int, least: int, most: int) -> list[slice]:

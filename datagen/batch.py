@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from biem.backend import Array, count, from_numpy, to_numpy
+from biem.backend import Array, array_namespace, count, from_numpy, to_numpy
 from biem.curves.crossing import self_crossings
 from biem.curves.fourier import remove_nyquist, resample
 from biem.errors import NumericalFailure

@@ -15,10 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from array_api_compat import array_namespace
 from torch import Tensor
 
-from biem.backend import Array, Latest, count, from_numpy, on_cpu, parallel_map, shares, to_numpy
+from biem.backend import Array, Latest, array_namespace, count, from_numpy, on_cpu, parallel_map, shares, to_numpy
 from biem.curves.curve import center_of_nodes, cross, curvature, dot, length, speed, tangent
 from biem.curves.fourier import derivative
 from biem.curves.pose import Pose, standardize

@@ -2,16 +2,15 @@
 
     X~ = X + lambda_1 n + lambda_2 c n     (n: gradient of the area, -c n: of the length)     with area(X~) = A_0, length(X~) = L_0
 
-Both directions are taken at X; two equations in (lambda_1, lambda_2) per vesicle are solved by Newton's method, batched. Where A_0 and
+Both directions are taken at X, so that X~ and its derivative are linear in (lambda_1, lambda_2); two equations per vesicle are solved
+by Newton's method, batched. Where A_0 and
 L_0 leave next to no other shape than the circle, c n cannot take all modes away at once: there the second direction leads to the circle.
 """
 
 from __future__ import annotations
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array
-from biem.curves.curve import area, center_of_nodes, cross, curvature, dot, length, normal, tangent
+from biem.backend import Array, array_namespace
+from biem.curves.curve import center_of_nodes, cross, dot
 from biem.curves.fourier import derivative, remove_nyquist
 from biem.errors import NumericalFailure
 
@@ -28,24 +27,25 @@ def restore_area_length(X: Array, area_0: Array, length_0: Array, first: int = 0
     taken there. Raises NumericalFailure, naming the vesicle (counted from `first`), where no such shape is near.
     """
     xp = array_namespace(X)
-    off = _errors(X, area_0, length_0)
+    r = X - center_of_nodes(X)
+    r_alpha = derivative(r)
+    off = _errors(r, r_alpha, area_0, length_0)
     wrong = ~(xp.max(xp.abs(off), axis=-1) <= TOLERANCE)  # true for NaN
     changed = int(xp.sum(xp.astype(wrong, xp.int64)))
     if changed == 0:
         return X, 0
-    n = remove_nyquist(normal(X))
-    bent = (curvature(X) * length_0[:, None] / (2 * xp.pi))[:, None, :] * n
-    nearly = 1.0 - 4.0 * xp.pi * area_0 / length_0**2 < NEARLY_A_CIRCLE
-    directions = [n, remove_nyquist(xp.where(nearly[:, None, None], _to_circle(X, length_0), bent))]
-    Y = X
+    d = _directions(r, r_alpha, area_0, length_0)
+    d_alpha = derivative(d)
+    lambdas = xp.zeros((X.shape[0], 2), dtype=X.dtype, device=X.device)
+    moved = lambda f, rate: f + xp.sum(lambdas[:, :, None, None] * rate, axis=1)
+    Y, Y_alpha = r, r_alpha
     for _ in range(MAX_ITERATIONS):
-        J = xp.stack([_derivatives(Y, d, area_0, length_0) for d in directions], axis=-1)
-        lambdas = _least_squares(J, -off)
-        step = lambdas[:, 0, None, None] * directions[0] + lambdas[:, 1, None, None] * directions[1]
-        Y = xp.where((xp.max(xp.abs(off), axis=-1) > TOLERANCE)[:, None, None], Y + step, Y)
-        off = _errors(Y, area_0, length_0)
+        step = _least_squares(_derivatives(Y_alpha, d, d_alpha, area_0, length_0), -off)
+        lambdas = xp.where((xp.max(xp.abs(off), axis=-1) > TOLERANCE)[:, None], lambdas + step, lambdas)
+        Y, Y_alpha = moved(r, d), moved(r_alpha, d_alpha)
+        off = _errors(Y, Y_alpha, area_0, length_0)
         if float(xp.max(xp.abs(off))) <= TOLERANCE:
-            return Y, changed
+            return moved(X, d), changed
     worst = int(xp.argmax(xp.max(xp.abs(off), axis=-1)))
     raise NumericalFailure(
         f"area and length of vesicle {first + worst} could not be restored: relative errors {float(off[worst, 0]):.1e}, "
@@ -53,11 +53,16 @@ def restore_area_length(X: Array, area_0: Array, length_0: Array, first: int = 0
     )
 
 
-def _to_circle(X: Array, length_0: Array) -> Array:
-    """From X (M, 2, N) to the circles of that length about the means of the nodes, along their radii."""
-    xp = array_namespace(X)
-    r = X - center_of_nodes(X)
-    return r * (length_0[:, None] / (2 * xp.pi) / xp.sqrt(dot(r, r)) - 1.0)[:, None, :]
+def _directions(r: Array, r_alpha: Array, area_0: Array, length_0: Array) -> Array:
+    """n, and c n or the way to the circle (M, 2, 2, N): displacements of curves r (M, 2, N) about their centres."""
+    xp = array_namespace(r)
+    v = xp.sqrt(dot(r_alpha, r_alpha))
+    n = remove_nyquist(xp.stack([r_alpha[:, 1], -r_alpha[:, 0]], axis=1) / v[:, None, :])
+    R = length_0[:, None] / (2.0 * xp.pi)
+    bent = (R * cross(r_alpha, derivative(r_alpha)) / v**3)[:, None, :] * n
+    to_circle = r * (R / xp.sqrt(dot(r, r)) - 1.0)[:, None, :]  # of that length about the centre, along the radii
+    nearly = 1.0 - 4.0 * xp.pi * area_0 / length_0**2 < NEARLY_A_CIRCLE
+    return xp.stack([n, remove_nyquist(xp.where(nearly[:, None, None], to_circle, bent))], axis=1)
 
 
 def _least_squares(J: Array, b: Array) -> Array:
@@ -71,14 +76,20 @@ def _least_squares(J: Array, b: Array) -> Array:
     return xp.where(regular[:, None], adjugate / xp.where(regular, det, size)[:, None], rank_one)
 
 
-def _errors(X: Array, area_0: Array, length_0: Array) -> Array:
-    return array_namespace(X).stack([area(X) / area_0 - 1.0, length(X) / length_0 - 1.0], axis=-1)
+def _errors(r: Array, r_alpha: Array, area_0: Array, length_0: Array) -> Array:
+    """Relative errors (M, 2) of the area and the length of curves r (M, 2, N)."""
+    xp = array_namespace(r)
+    h = 2.0 * xp.pi / r.shape[-1]
+    A = 0.5 * h * xp.sum(cross(r, r_alpha), axis=-1)
+    L = h * xp.sum(xp.sqrt(dot(r_alpha, r_alpha)), axis=-1)
+    return xp.stack([A / area_0 - 1.0, L / length_0 - 1.0], axis=-1)
 
 
-def _derivatives(X: Array, d: Array, area_0: Array, length_0: Array) -> Array:
-    """Directional derivatives (M, 2) of the relative area and length along d (M, 2, N)."""
-    xp = array_namespace(X)
-    h = 2.0 * xp.pi / X.shape[-1]
-    dA = xp.sum(cross(d, derivative(X - center_of_nodes(X))), axis=-1) * h
-    dL = xp.sum(dot(tangent(X), derivative(d)), axis=-1) * h
-    return xp.stack([dA / area_0, dL / length_0], axis=-1)
+def _derivatives(r_alpha: Array, d: Array, d_alpha: Array, area_0: Array, length_0: Array) -> Array:
+    """Derivatives (M, 2, 2) of the relative area (first row) and length along the displacements d (M, 2, 2, N)."""
+    xp = array_namespace(d)
+    h = 2.0 * xp.pi / d.shape[-1]
+    t = r_alpha / xp.sqrt(dot(r_alpha, r_alpha))[:, None, :]
+    dA = h * xp.sum(cross(d, r_alpha[:, None]), axis=-1) / area_0[:, None]
+    dL = h * xp.sum(dot(t[:, None], d_alpha), axis=-1) / length_0[:, None]
+    return xp.stack([dA, dL], axis=1)

@@ -53,11 +53,13 @@ def _cut(X: np.ndarray) -> np.ndarray:
 
 def _narrow(X: np.ndarray) -> np.ndarray:
     """Whether two sides of a curve may meet between corners of its polygon (M,): nodes no neighbours, no farther apart than neighbours."""
-    spacing = np.hypot(*np.moveaxis(X - np.roll(X, 1, axis=-1), 1, 0)).max(axis=-1)
-    reach = (spacing + 2.0 * _cut(X))[:, None]
+    N = X.shape[-1]
+    twice = np.concatenate([X, X], axis=-1)
+    squares = lambda lag: ((X - twice[..., N - lag : 2 * N - lag]) ** 2).sum(axis=1)  # of the distances of nodes k and k - lag
+    reach = (np.sqrt(squares(1).max(axis=-1)) + 2.0 * _cut(X))[:, None] ** 2
     narrow = np.zeros(X.shape[0], dtype=bool)
-    for lag in range(NEIGHBOURS + 1, X.shape[-1] // 2 + 1):
-        narrow |= (np.hypot(*np.moveaxis(X - np.roll(X, lag, axis=-1), 1, 0)) < reach).any(axis=-1)
+    for lag in range(NEIGHBOURS + 1, N // 2 + 1):
+        narrow |= (squares(lag) < reach).any(axis=-1)
     return narrow
 
 

@@ -6,9 +6,7 @@ All integrals are trapezoid sums in alpha (spectrally accurate) about the mean n
 
 from __future__ import annotations
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array
+from biem.backend import Array, array_namespace
 from biem.curves.fourier import derivative
 
 

@@ -7,9 +7,9 @@ derivative ever sees it. Trefethen, Spectral Methods in MATLAB (2000), chapter 3
 from __future__ import annotations
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import device
 
-from biem.backend import Array, compiled, constant, from_numpy, irfft, on_cpu, rfft, to_numpy
+from biem.backend import Array, array_namespace, compiled, constant, from_numpy, irfft, on_cpu, rfft, to_numpy
 
 COMPILED_ABOVE = 100_000  # cosines in one `evaluate`, from which the compiled loop is worth loading
 

@@ -16,9 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array, rfft
+from biem.backend import Array, array_namespace, rfft
 from biem.curves.curve import center_of_nodes, cross, dot, length
 from biem.curves.fourier import derivative, remove_nyquist, resample, shift
 

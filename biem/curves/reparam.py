@@ -6,9 +6,7 @@ The new parameters solve  alpha~ + g(alpha~)/v_0 = alpha_k,  where speed = v_0 +
 
 from __future__ import annotations
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array, constant
+from biem.backend import Array, array_namespace, constant
 from biem.curves.curve import center_of_nodes, speed
 from biem.curves.fourier import _all_wavenumbers, coefficients, evaluate, remove_nyquist, resample
 from biem.errors import NumericalFailure
@@ -27,13 +25,14 @@ def equal_arclength_parameters(X: Array, first: int = 0) -> Array:
     v_0 = xp.real(c[..., 0])
     k = constant(_all_wavenumbers, REFINEMENT * N, like=X)
     periodic = c / (1j * xp.where(k == 0, xp.ones_like(k), k))  # coefficients of g
-    periodic = xp.where(k == 0, xp.zeros_like(periodic), periodic)
+    both = xp.concat([c, xp.where(k == 0, xp.zeros_like(periodic), periodic)], axis=1) / v_0[..., None]
     alpha_k = xp.arange(N, dtype=X.dtype, device=X.device) * (2.0 * xp.pi / N)
     alpha = alpha_k + xp.zeros((X.shape[0], N), dtype=X.dtype, device=X.device)
     tolerance = 1e-13 if X.dtype == xp.float64 else 1e-6
     for _ in range(30):
-        slope = evaluate(c, alpha)[:, 0] / v_0
-        step = (alpha + evaluate(periodic, alpha)[:, 0] / v_0 - alpha_k) / xp.where(slope > 0.05, slope, xp.ones_like(slope))
+        values = evaluate(both, alpha)
+        slope, ahead = values[:, 0], values[:, 1]
+        step = (alpha + ahead - alpha_k) / xp.where(slope > 0.05, slope, xp.ones_like(slope))
         alpha = alpha - step
         if float(xp.max(xp.abs(step))) < tolerance:
             return alpha

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from biem.backend import Array, Latest
+from biem.backend import Array, Latest, array_namespace
 from biem.curves.curve import length, normal
 from biem.curves.fourier import read_back, resample
 from biem.membrane.resultants import Resultants

@@ -11,9 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array, constant, count, solve
+from biem.backend import Array, array_namespace, constant, count, solve
 from biem.curves.curve import center_of_nodes, d_ds, dot, speed, tangent
 from biem.curves.fourier import differentiation_matrix
 from biem.stokes.quadrature import full_matrix, single_layer_blocks

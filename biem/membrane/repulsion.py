@@ -13,9 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from biem.backend import Array, count, from_numpy, scatter_add, to_numpy
+from biem.backend import Array, array_namespace, count, from_numpy, scatter_add, to_numpy
 from biem.curves.curve import arclength_weights, length
 from biem.curves.fourier import coefficients, evaluate, interpolation_matrix
 from biem.stokes.near_search import NearPairs, find_near

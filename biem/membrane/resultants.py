@@ -21,9 +21,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import pi
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array, compiled, constant, count, from_numpy, on_cpu, parallel_map, shares, solve, to_numpy
+from biem.backend import Array, array_namespace, compiled, constant, count, from_numpy, on_cpu, parallel_map, shares, solve, to_numpy
 from biem.curves.curve import center_of_nodes, d_ds, dot
 from biem.curves.fourier import derivative, differentiation_matrix
 from biem.stokes.kress import apply_single_layer, single_layer_kernel
@@ -147,6 +145,8 @@ class Resultants:
         return parts[0] if len(parts) == 1 else array_namespace(self.X).concat(parts, axis=0)
 
     def _part(self, which: slice) -> Resultants:
+        if which.stop - which.start >= self.X.shape[0]:
+            return self
         part = Resultants(self.X[which], self.kappa_b, self.mu, self.dtype)
         part.__dict__.update({name: value[which] for name, value in self.__dict__.items() if name in GEOMETRY})
         return part

@@ -22,9 +22,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array, to_numpy
+from biem.backend import Array, array_namespace, to_numpy
 
 KINDS = ("quiescent", "shear", "extensional", "poiseuille", "taylor_green", "rotation", "custom")
 NEEDS_WIDTH = ("poiseuille", "taylor_green", "rotation")

@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array, count, from_numpy, on_cpu, parallel_map, shares, stage, to_numpy
+from biem.backend import Array, array_namespace, count, from_numpy, on_cpu, parallel_map, shares, stage, to_numpy
 from biem.curves.conserve import restore_area_length
 from biem.curves.curve import area, length
 from biem.curves.reparam import redistribute

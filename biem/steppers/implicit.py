@@ -16,10 +16,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from array_api_compat import array_namespace
 from scipy.sparse.linalg import LinearOperator, gmres
 
-from biem.backend import Array, constant, count, from_numpy, one_blas_thread, parallel_map, stage, to_numpy
+from biem.backend import Array, array_namespace, constant, count, from_numpy, one_blas_thread, parallel_map, stage, to_numpy
 from biem.curves.fourier import read_back, read_back_matrix, resample, resampling_matrix
 from biem.errors import NumericalFailure
 from biem.membrane.maps import operator_points

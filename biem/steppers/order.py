@@ -42,7 +42,8 @@ class Extrapolated:
             if name in diagnostics:
                 diagnostics[name] = half.diagnostics.get(name, 0.0) + two.diagnostics.get(name, 0.0)
         before, after = to_numpy(state.X), to_numpy(X)  # the same bits also where a restart hands a NumPy state to a solver on tensors
-        diagnostics["error_estimate"] = float(np.max(np.abs(to_numpy(fine.X - coarse.X))) / np.mean(length(before)))
-        for name, measure in (("area_change", area), ("length_change", length)):
-            diagnostics[name] = float(np.max(np.abs(measure(after) / measure(before) - 1.0)))
+        length_before = length(before)
+        diagnostics["error_estimate"] = float(np.max(np.abs(to_numpy(fine.X - coarse.X))) / np.mean(length_before))
+        for name, ratio in (("area_change", area(after) / area(before)), ("length_change", length(after) / length_before)):
+            diagnostics[name] = float(np.max(np.abs(ratio - 1.0)))
         return StepResult(State(state.t + dt, X, sigma, coupling), diagnostics)

@@ -14,9 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array, Latest, one_blas_thread, stage
+from biem.backend import Array, Latest, array_namespace, one_blas_thread, stage
 from biem.membrane.maps import MembraneMaps, Monitored
 from biem.membrane.operators import bending_force, tension_force
 from biem.membrane.repulsion import Repulsion, work_of

@@ -23,9 +23,9 @@ from functools import cached_property
 from math import pi
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import device
 
-from biem.backend import Array, compiled, from_numpy, on_cpu, to_numpy
+from biem.backend import Array, array_namespace, compiled, from_numpy, on_cpu, to_numpy
 from biem.curves.curve import dot
 from biem.curves.fourier import derivative, differentiation_matrix
 from biem.stokes.kernels import double_layer

@@ -10,9 +10,9 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 import numpy as np
-from array_api_compat import array_namespace, is_torch_array
+from array_api_compat import is_torch_array
 
-from biem.backend import Array, compiled, count, from_numpy, on_cpu, to_numpy
+from biem.backend import Array, array_namespace, compiled, count, from_numpy, on_cpu, to_numpy
 from biem.stokes.kernels import stokeslet, stokeslet_prefactor
 
 CHUNK = 1 << 20  # pairs of one temporary

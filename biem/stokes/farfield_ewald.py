@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 import scipy.fft
-from array_api_compat import array_namespace, is_torch_array
+from array_api_compat import is_torch_array
 from scipy.special import erfc, exp1
 
-from biem.backend import Array, compiled, count, from_numpy, threads, to_numpy
+from biem.backend import Array, array_namespace, compiled, count, from_numpy, threads, to_numpy
 from biem.stokes.farfield_direct import own_sum, own_sum_of_arrays
 from biem.stokes.kernels import stokeslet_prefactor
 

@@ -10,9 +10,8 @@ from math import log
 
 import triton
 import triton.language as tl
-from array_api_compat import array_namespace
 
-from biem.backend import Array
+from biem.backend import Array, array_namespace
 from biem.stokes.kernels import LOG_SIGN
 
 TARGETS, SOURCES = 64, 32  # block of pairs: 16 per thread with 4 warps

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from biem.backend import Array, from_numpy, stage, to_numpy
+from biem.backend import Array, array_namespace, from_numpy, stage, to_numpy
 from biem.curves.curve import arclength_weights, length
 from biem.stokes.farfield import PairSum, pair_sum
 from biem.stokes.near import apply_rows, near_correction, near_width

@@ -14,9 +14,7 @@ from __future__ import annotations
 
 from math import pi
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array
+from biem.backend import Array, array_namespace
 
 LOG_SIGN = -1.0  # with +log the flow is not divergence-free
 

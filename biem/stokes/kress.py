@@ -13,9 +13,8 @@ from functools import cache
 from math import pi
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from biem.backend import Array, compiled, constant, count, from_numpy, on_cpu, to_numpy
+from biem.backend import Array, array_namespace, compiled, constant, count, from_numpy, on_cpu, to_numpy
 from biem.curves.curve import center_of_nodes, dot
 from biem.curves.fourier import derivative, resample
 from biem.stokes.kernels import LOG_SIGN, stokeslet, stokeslet_prefactor

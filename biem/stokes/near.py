@@ -11,9 +11,8 @@ from __future__ import annotations
 from math import log, pi
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from biem.backend import Array, constant, count, from_numpy, scatter_add, to_numpy
+from biem.backend import Array, array_namespace, constant, count, from_numpy, scatter_add, to_numpy
 from biem.curves.curve import center_of_nodes, speed
 from biem.curves.fourier import coefficients, evaluate, interpolation_matrix, resample, resampling_matrix, shift
 from biem.stokes.kernels import stokeslet

@@ -16,10 +16,23 @@ from dataclasses import dataclass
 from math import log
 
 import numpy as np
-from array_api_compat import array_namespace, is_numpy_array
+from array_api_compat import is_numpy_array
 from scipy.linalg import lapack
 
-from biem.backend import Array, compiled, constant, count, from_numpy, irfft, on_cpu, parallel_map, rfft, scatter_add, to_numpy
+from biem.backend import (
+    Array,
+    array_namespace,
+    compiled,
+    constant,
+    count,
+    from_numpy,
+    irfft,
+    on_cpu,
+    parallel_map,
+    rfft,
+    scatter_add,
+    to_numpy,
+)
 from biem.curves.curve import arclength_weights, center_of_nodes, cross, dot, length, normal
 from biem.curves.fourier import coefficients, derivative, evaluate, resample
 from biem.stokes.farfield_direct import own_sum, own_sum_of_arrays

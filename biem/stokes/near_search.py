@@ -18,10 +18,10 @@ from math import ceil, inf, log2, pi
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import device
 from scipy.spatial import cKDTree
 
-from biem.backend import Array, compiled, count, on_cpu, to_numpy
+from biem.backend import Array, array_namespace, compiled, count, on_cpu, to_numpy
 from biem.curves.curve import center_of_nodes, length
 from biem.curves.fourier import coefficients, evaluate, resample
 

@@ -11,9 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from array_api_compat import array_namespace
-
-from biem.backend import Array, count, from_numpy, on_cpu, scatter_add, to_numpy
+from biem.backend import Array, array_namespace, count, from_numpy, on_cpu, scatter_add, to_numpy
 from biem.curves.curve import arclength_weights, center_of_nodes
 from biem.curves.fourier import resample
 from biem.stokes.farfield_direct import own_sum, own_sum_of_arrays

@@ -9,9 +9,8 @@ auxiliary part is one product (n x 2m)(2m x n) in the index (i, j - i). Alpert (
 from __future__ import annotations
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from biem.backend import Array, constant, count, irfft, rfft
+from biem.backend import Array, array_namespace, constant, count, irfft, rfft
 from biem.curves.curve import center_of_nodes, speed
 from biem.curves.fourier import _all_wavenumbers, _wavenumbers, interpolation_matrix
 from biem.stokes.alpert_tables import RULES

@@ -22,11 +22,10 @@ from itertools import pairwise
 from math import pi
 
 import numpy as np
-from array_api_compat import array_namespace
 from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial import cKDTree
 
-from biem.backend import Array, all_blas_threads, count, from_numpy, to_numpy
+from biem.backend import Array, all_blas_threads, array_namespace, count, from_numpy, to_numpy
 from biem.stokes.cauchy import Curve
 from biem.stokes.kernels import double_layer, stokeslet
 from biem.stokes.near_search import locate
