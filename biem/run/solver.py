@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from biem.membrane.maps import LAYERS, ExactMaps, MapsRequest, MembraneMaps
-from biem.membrane.repulsion import Repulsion
+from biem.observe.instant import repulsion_of
 from biem.ranks import ALONE, Ranks
 from biem.scene.build import Problem
 from biem.scene.config import Scene
@@ -108,7 +108,7 @@ def _implicit(problem: Problem) -> Stepper:
         solver.tolerance,
         solver.max_iterations,
         _fields(problem.scene),
-        _repulsion(problem),
+        repulsion_of(problem),
         problem.scene.output.tension,
         problem.walls,
     )
@@ -125,7 +125,7 @@ def _split(problem: Problem, ranks: Ranks) -> Stepper:
         physics.mu,
         _flow(problem),
         fields,
-        _repulsion(problem),
+        repulsion_of(problem),
         scene.output.tension,
         ranks,
         walls=problem.walls,
@@ -171,12 +171,3 @@ def _fields(scene: Scene) -> Fields:
 
 def _flow(problem: Problem) -> Flow | None:
     return None if problem.flow.kind == "quiescent" else problem.flow.velocity
-
-
-def _repulsion(problem: Problem) -> Repulsion | None:
-    """Reach and strength from the unit of the scene's mean membrane length to that of X."""
-    table = problem.scene.solver.repulsion
-    if table is None:
-        return None
-    length = problem.length
-    return Repulsion(table.reach * length, table.strength * problem.scene.physics.kappa_b / length**3, problem.walls)
