@@ -37,7 +37,7 @@ def pair_crossings(X: Array, shapes: np.ndarray | None = None) -> list[tuple[int
         return []
     shapes = polygons(X) if shapes is None else shapes
     cut = _cut(X)
-    boxes = shapely.box(*(shapely.bounds(shapes) + cut[:, None] * np.array([-1.0, -1.0, 1.0, 1.0])).T)
+    boxes = _boxes(shapes, cut)
     i, j = shapely.STRtree(boxes).query(boxes)  # boxes that meet; to prepare polygons for so few tests each would not pay
     i, j = i[i < j], j[i < j]
     meet = shapely.dwithin(shapes[i], shapes[j], cut[i] + cut[j])
@@ -71,6 +71,13 @@ def fluid_region(curves: Sequence[np.ndarray]) -> shapely.Polygon:
     return region
 
 
-def outside_region(shapes: np.ndarray, region: shapely.Polygon) -> list[int]:
-    """Indices of the polygons that do not lie in the region."""
-    return np.flatnonzero(~shapely.contains_properly(region, shapes)).tolist()
+def outside_region(X: Array, region: shapely.Polygon, shapes: np.ndarray | None = None) -> list[int]:
+    """Indices of curves that do not lie in the region. shapes: polygons(X) where they are at hand."""
+    X = to_numpy(X)
+    suspect = np.flatnonzero(~shapely.contains_properly(region, _boxes(polygons(X) if shapes is None else shapes, _cut(X))))
+    return [int(i) for i in suspect if not shapely.contains_properly(region, polygons(X[[i]], FINE)[0])]
+
+
+def _boxes(shapes: np.ndarray, margin: np.ndarray) -> np.ndarray:
+    """Boxes about the polygons (M,), wider by the margin (M,) on every side."""
+    return shapely.box(*(shapely.bounds(shapes) + margin[:, None] * np.array([-1.0, -1.0, 1.0, 1.0])).T)

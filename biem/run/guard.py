@@ -35,6 +35,6 @@ def check_state(
     pairs = pair_crossings(values, shapes)
     if pairs:
         raise NumericalFailure(f"vesicles {pairs[0][0]} and {pairs[0][1]} cross ({len(pairs)} pair(s) in all)")
-    out = [] if region is None else outside_region(shapes, region)
+    out = [] if region is None else outside_region(values, region, shapes)
     if out:
         raise NumericalFailure(f"vesicle {out[0]} crosses a wall ({len(out)} vesicle(s) do)")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from biem.curves.crossing import fluid_region, outside_region, pair_crossings, polygons, self_crossings
+from biem.curves.crossing import fluid_region, outside_region, pair_crossings, self_crossings
 from biem.curves.curve import area, bending_energy, length
 from biem.run.trajectory import Trajectory
 
@@ -41,7 +41,7 @@ def verify(trajectory: Trajectory) -> list[Check]:
     checks.append(Check("no crossing", not crossed, f"frames {crossed[:5]}" if crossed else "none"))
     if "walls" in trajectory.attributes:
         region = fluid_region(trajectory.attributes["walls"])
-        out = [k for k in range(len(t)) if outside_region(polygons(X[k]), region)]
+        out = [k for k in range(len(t)) if outside_region(X[k], region)]
         checks.append(Check("between the walls", not out, f"frames {out[:5]}" if out else "all vesicles"))
     stored = trajectory.diagnostics["bending_energy"]
     energy = np.array([float(bending_energy(frame, scene["physics"]["kappa_b"]).sum()) for frame in X])

@@ -290,7 +290,7 @@ def _check_membranes(X: np.ndarray, region: shapely.Polygon | None) -> None:
     if pairs:
         i, j = pairs[0]
         raise ValueError(f"vesicles {i} and {j} overlap ({len(pairs)} pair(s) in all do): move them apart")
-    out = [] if region is None else outside_region(polygons(X), region)
+    out = [] if region is None else outside_region(X, region)
     if out:
         raise ValueError(f"vesicle {out[0]} is not between the walls ({len(out)} in all are not): move it into the fluid")
     nu = reduced_area(X)

@@ -27,6 +27,7 @@ FINISHED, SMALLER, REFUSED, ILL = "finished", "finished with smaller steps", "re
 BAD_INPUT, REJECTED = 2, 3  # exit codes
 COUNTED = {"area_error": "area_length_restored", "length_error": "area_length_restored"}  # diagnostics, and what counts their correction
 UNALTERED = 1e-9  # relative error of area or length that nothing needs to correct
+ROOT = Path(__file__).resolve().parents[2]
 LONGEST_LINE = 600
 
 
@@ -174,6 +175,8 @@ def _outcome(case: Case, attempts: list[Attempt], last: Kept | None, folder: Pat
     finished = final.code == 0 and not final.problems
     outcome = ILL if problems else (FINISHED if len(attempts) == 1 else SMALLER) if finished else REFUSED
     line = "" if outcome == FINISHED else first.line if len(attempts) == 1 or outcome == SMALLER else _last_rejection(attempts)
+    for where in (folder.resolve(), ROOT):  # the same line wherever it was said
+        line = line.replace(f"{where}/", "")
     base = Outcome(case.axis, case.value, case.rung, outcome, final.how if finished else first.how, line, problems, attempts)
     if last is None:
         return base

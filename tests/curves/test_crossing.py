@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers import blob, circle, dumbbell, nodes
 
-from biem.curves.crossing import pair_crossings, polygons, self_crossings
+from biem.curves.crossing import fluid_region, outside_region, pair_crossings, polygons, self_crossings
 from biem.curves.shapes import equilibrium, place
 
 
@@ -118,3 +118,13 @@ def test_polygons_run_through_the_refined_curve():
     P = polygons(circle(32)[None], 8)[0]
     n = 8 * 32
     assert pytest.approx(0.5 * n * np.sin(2 * np.pi / n), rel=1e-12) == P.area
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi / 32, np.pi / 100])
+@pytest.mark.parametrize("depth", [1e-2, 1e-3, 1e-4, 2e-5, -2e-5, -1e-3])
+def test_a_circle_over_a_wall_is_found_however_shallow(depth, angle):
+    """A circle of 32 nodes in a round one of 512, touching it at a node or between nodes, and one about a round body in it."""
+    region = fluid_region([circle(512, 3.0), circle(512, 0.5)])
+    out = np.array([np.cos(angle), np.sin(angle)])
+    X = np.stack([circle(32, 1.0, (2 + depth) * out), circle(32, 1.0, (1.5 - depth) * -out), circle(32, 0.1, (0.0, 2.0))])
+    assert outside_region(X, region) == ([0, 1] if depth > 0 else [])
