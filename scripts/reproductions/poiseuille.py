@@ -1,7 +1,8 @@
 """One vesicle in Poiseuille flow: shapes, lateral positions and residual velocities in equilibrium, Cn x Ca, by all rungs.
 
-Runs end when y/W changes by less than `studies.steady.CHANGE` over `studies.steady.WINDOW` t_gamma. By networks, which relax over sums of
-1e-5 mu L^3/kappa_b, steps are 2e-5 of order 2 where that is at most LONGEST t_gamma, 1e-5 of order 1 where it is not.
+Runs start at W/2, and end when y/W changes by less than `studies.steady.CHANGE` over `studies.steady.WINDOW` t_gamma. Networks relax over
+sums of 1e-5 mu L^3/kappa_b, so that their steps are 2e-5 of order 2 where that is at most LONGEST t_gamma, 1e-5 of order 1 where it is
+not: a hundred times the reference's cost on the way, and so they start where the reference came to rest.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ BAR = 0.01  # of y/W
 LINEAR = 1e-4  # of the colours of residual velocities: below it they are linear
 
 
-def scene(name: str, cn: float, ca: float, quick: bool = False) -> Rung:
-    """A rung at Cn and Ca. quick: a twentieth of t_gamma."""
+def scene(name: str, cn: float, ca: float, start: float = 0.5, quick: bool = False) -> Rung:
+    """A rung at Cn and Ca, from y/W = start. quick: a twentieth of t_gamma."""
     dt = 0.05 if cn == 0.75 else 0.1
-    overrides = [f"vesicles.centers=[[0.0,{0.5 / cn!r}]]", f"flow.capillary={float(ca)}", f"flow.confinement={cn}"]
+    overrides = [f"vesicles.centers=[[0.0,{start / cn!r}]]", f"flow.capillary={float(ca)}", f"flow.confinement={cn}"]
     if name.startswith("vesnet"):
         t_gamma = 2.0 * R**3 / ca
         order = 2 if LONGEST * t_gamma >= 2.0 * LEARNED else 1
@@ -56,17 +57,25 @@ def measure(study: Study) -> Results:
     folder = study.folder(NAME)
     cases = list(product(CN, CA))[:1] if study.quick else list(product(CN, CA))
     names = study.rungs(RUNGS)
-    tasks = {}
-    for name, (cn, ca) in product(names, cases):
-        made = scene(name, cn, ca, study.quick)
-        tasks[f"{name} {cn} {ca}"] = Task(made, folder / made.file / f"cn{cn}_ca{ca}.h5")
-    runs = gather(study, tasks, "studies.steady:across_the_flow", "Poiseuille flow")
+    learned = [name for name in names if name.startswith("vesnet")]
+    runs: dict[str, Found] = {}
+    starts: dict[tuple[float, int], float] = {}
+    for group in ([name for name in names if name not in learned], learned):
+        tasks = {}
+        for name, (cn, ca) in product(group, cases):
+            made = scene(name, cn, ca, starts.get((cn, ca), 0.5), study.quick)
+            tasks[f"{name} {cn} {ca}"] = Task(made, folder / made.file / f"cn{cn}_ca{ca}.h5")
+        runs |= gather(study, tasks, "studies.steady:across_the_flow", "Poiseuille flow")
+        for cn, ca in cases:
+            reference = runs[f"{REFERENCE} {cn} {ca}"]
+            if reference.trajectory is not None and reference.state == FINISHED:
+                starts[cn, ca] = at_rest(reference.trajectory)["y"]
     rows = [_row(runs[f"{name} {cn} {ca}"], name, cn, ca) for name, (cn, ca) in product(names, cases)]
     expected = {(row["cn"], row["ca"]): row for row in rows if row["rung"] == REFERENCE}
     for row in rows:
-        at_rest = expected[row["cn"], row["ca"]]
-        if row["state"] == at_rest["state"] == FINISHED:
-            row["off"] = abs(abs(row["y"]) - abs(at_rest["y"]))
+        other = expected[row["cn"], row["ca"]]
+        if row["state"] == other["state"] == FINISHED:
+            row["off"] = abs(abs(row["y"]) - abs(other["y"]))
     pictures = [_lateral(rows, names, folder / "lateral.png")]
     shapes = {
         name: [(cn, ca, runs[f"{name} {cn} {ca}"], row) for row in rows for cn, ca in [(row["cn"], row["ca"])] if row["rung"] == name]
@@ -180,7 +189,7 @@ def section(results: Results) -> str:
             "**Found**:",
             *lines,
             "**Why they differ**: here exact operators take steps of order 2, networks those of order 1 where 2e-5 is above "
-            f"{LONGEST} t_gamma; operators at N = 32 are built at 64 nodes, and networks are trained on the converged flow. The paper's "
+            f"{LONGEST} t_gamma, and start where the reference came to rest; operators at N = 32 are built at 64 nodes, and networks are trained on the converged flow. The paper's "
             "VesNet at N = 128 has no counterpart: the shipped networks are for 32 nodes. The flow is unbounded, W is only the width of "
             "the parabola, as in the paper.",
         ]
