@@ -32,7 +32,7 @@ FFTW_PAYS_ABOVE = 50_000
 _counts: ContextVar[Counter[str] | None] = ContextVar("counts", default=None)
 _blas_single: ContextVar[bool] = ContextVar("blas_single", default=False)
 _compiled = threading.local()  # threads that numba was told to use, of each thread
-_timing: ContextVar[tuple[dict[str, float], Callable[[], None]] | None] = ContextVar("timing", default=None)
+_timing: ContextVar[tuple[dict[str, float], Callable[[], None], Callable[[], float]] | None] = ContextVar("timing", default=None)
 
 
 @contextmanager
@@ -54,10 +54,10 @@ def count(name: str, n: int = 1) -> None:
 
 
 @contextmanager
-def timing(wait: Callable[[], None] = lambda: None) -> Iterator[dict[str, float]]:
-    """Wall seconds of the stages that run inside the block, by name. wait: called at both ends of a stage, to let a device finish."""
+def timing(wait: Callable[[], None] = lambda: None, clock: Callable[[], float] = time.perf_counter) -> Iterator[dict[str, float]]:
+    """Seconds of the stages that run inside the block, by name. wait: called at both ends of a stage, to let a device finish."""
     seconds: dict[str, float] = {}
-    token = _timing.set((seconds, wait))
+    token = _timing.set((seconds, wait, clock))
     try:
         yield seconds
     finally:
@@ -66,17 +66,17 @@ def timing(wait: Callable[[], None] = lambda: None) -> Iterator[dict[str, float]
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Adds the wall time of the block to the stage `name` of the innermost `timing()` block, if there is one. Stages do not nest."""
-    clock = _timing.get()
-    if clock is None:
+    """Adds the time of the block to the stage `name` of the innermost `timing()` block, if there is one. Stages do not nest."""
+    timed = _timing.get()
+    if timed is None:
         yield
         return
-    seconds, wait = clock
+    seconds, wait, clock = timed
     wait()
-    begin = time.perf_counter()
+    begin = clock()
     yield
     wait()
-    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - begin
+    seconds[name] = seconds.get(name, 0.0) + clock() - begin
 
 
 def array_namespace(*arrays: Array) -> Any:

@@ -53,7 +53,7 @@ class Record:
     wall_a_step: float = 0.0
     cpu_a_step: float = 0.0
     peak_bytes: float = 0.0
-    seconds: Mapping[str, float] = field(default_factory=dict)  # a step, by stage
+    seconds: Mapping[str, float] = field(default_factory=dict)  # CPU, a step, by stage
     counts: Mapping[str, float] = field(default_factory=dict)
     threads: int = 1
     commit: str = ""
@@ -161,7 +161,7 @@ def run(scene: Scene, path: Path, ending: Ending | None = None) -> Record:
         pass  # the run itself says it
     cpu, counts, code = time.process_time(), {}, 0
     first = int(read_trajectory(path).step[-1]) if begun else 0
-    with timing() as seconds, warnings.catch_warnings(record=True) as shown:
+    with timing(clock=time.process_time) as seconds, warnings.catch_warnings(record=True) as shown:
         try:
             counts = dict(simulate(scene, path, resume=begun, force=not begun, progress=True, enough=enough).counts)
         except (NumericalFailure, ValueError, MemoryError) as error:
