@@ -6,6 +6,11 @@ Tension makes the membranes inextensible under all that moves them:
 
 solved by GMRES, block-diagonally preconditioned as it stands. Then u = u_inf + S f + K f with f = f_b + f_sigma + f_r is the velocity
 of the nodes. A stepper's own tension lags by up to a step; this one does not.
+
+Where viscosities differ (`membrane.contrast`), the outer velocity v is solved for, with u = A^-1 (S f + v) and K also the double layers of
+the others' velocities:
+
+    v - K (f, u) = u_inf + S f_r,     sigma = -L^-1 P A^-1 (S f_b + v),  or as given
 """
 
 from __future__ import annotations
@@ -18,6 +23,7 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from biem.backend import one_blas_thread
 from biem.errors import NumericalFailure
+from biem.membrane.contrast import ContrastMaps
 from biem.membrane.maps import ExactMaps
 from biem.membrane.operators import bending_force, tension_force
 from biem.membrane.repulsion import Repulsion
@@ -30,7 +36,7 @@ MOST_ITERATIONS = 200
 
 @dataclass(frozen=True)
 class Instant:
-    """Of membranes X at t: tension sigma (M, N); force density f = f_b + f_sigma + f_r on the fluid and velocity u of the nodes (M, 2, N)."""
+    """Of membranes X at t: tension sigma (M, N); force density f_b + f_sigma + f_r on the fluid, velocity of the nodes (M, 2, N)."""
 
     t: float
     X: np.ndarray
@@ -46,15 +52,21 @@ def instant(problem: Problem, X: np.ndarray, t: float = 0.0, sigma: np.ndarray |
     fields. Raises NumericalFailure where GMRES does not reach it.
     """
     physics, solver = problem.scene.physics, problem.scene.solver
-    M, _, N = X.shape
+    M = X.shape[0]
     u_inf = 0.0 * X if problem.flow.kind == "quiescent" else problem.flow.velocity(X, t)
     with one_blas_thread():
         fields = Fields(near_tolerance=tolerance, far_tolerance=tolerance)
-        alone = M == 1 and problem.walls is None
-        others = None if alone else Interaction.build(X, physics.mu, fields, stored=True, walls=problem.walls)
-        velocity_of_others = lambda f: 0.0 * X if others is None else others.velocity(f)
+        lattice = None if problem.box is None else problem.box.at(t)
+        alone = M == 1 and problem.walls is None and lattice is None
+        around = problem.walls, problem.contrast, lattice
+        others = None if alone else Interaction.build(X, physics.mu, fields, slice(None), True, *around)
         repulsion = repulsion_of(problem)
-        repulsive = None if repulsion is None else repulsion.force(X)
+        repulsive = None if repulsion is None else repulsion.force(X, lattice)
+        if problem.contrast is not None:
+            if repulsive is not None:
+                u_inf = u_inf + on_own_curve(X, repulsive, physics.mu)
+            return Instant(t, X, *_with_contrast(problem, X, u_inf, others, repulsive, sigma, tolerance))
+        velocity_of_others = lambda f: 0.0 * X if others is None else others.velocity(f)
         force = bending_force(X, physics.kappa_b) + (0.0 if repulsive is None else repulsive)
         if sigma is None:
             maps = ExactMaps(physics.kappa_b, physics.mu, solver.operator_points)
@@ -66,6 +78,38 @@ def instant(problem: Problem, X: np.ndarray, t: float = 0.0, sigma: np.ndarray |
             sigma = rhs if alone else _gmres(apply, rhs, tolerance)
         force = force + tension_force(X, sigma)
         return Instant(t, X, sigma, force, u_inf + velocity_of_others(force) + on_own_curve(X, force, physics.mu))
+
+
+def _with_contrast(
+    problem: Problem,
+    X: np.ndarray,
+    u_inf: np.ndarray,
+    others: Interaction | None,
+    repulsive: np.ndarray | None,
+    sigma: np.ndarray | None,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tension, force and velocity."""
+    assert problem.contrast is not None
+    physics = problem.scene.physics
+    maps = ContrastMaps(physics.kappa_b, physics.mu, problem.scene.solver.operator_points, contrast=problem.contrast)
+    bending = bending_force(X, physics.kappa_b)
+    zero = 0.0 * X
+
+    def tense(v: np.ndarray) -> np.ndarray:
+        """The part of the tension's force that depends on v."""
+        return tension_force(X, -maps.flow_tension(X, v)) if sigma is None else zero
+
+    elastic = bending + tension_force(X, -maps.self_tension(X) if sigma is None else sigma)  # the part that does not
+    v = u_inf
+    if others is not None:
+        force = elastic + (zero if repulsive is None else repulsive)
+        rhs = u_inf + others.velocity(force, maps.velocity(X, elastic, zero))
+        v = _gmres(lambda v: v - others.velocity(tense(v), maps.velocity(X, tense(v), v)), rhs, tolerance)
+    if sigma is None:
+        sigma = -(maps.self_tension(X) + maps.flow_tension(X, v))
+    elastic = bending + tension_force(X, sigma)
+    return sigma, elastic + (zero if repulsive is None else repulsive), maps.velocity(X, elastic, v)
 
 
 def repulsion_of(problem: Problem) -> Repulsion | None:

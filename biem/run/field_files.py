@@ -1,0 +1,68 @@
+"""Files of fields: HDF5 of grids or points, text of points.
+
+out.h5, of grids: t (F,), frame (F,), x (F, nx), y (F, ny), inside (F, ny, nx), and of the quantities velocity (F, ny, nx, 2),
+pressure and vorticity (F, ny, nx), stress (F, ny, nx, 2, 2). Of points: points (P, 2), and the same with P in place of ny, nx.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from biem.run.fields import FrameFields, Request
+from biem.run.files import atomic_h5, one_line, write_atomically
+
+ABOUT = (
+    "inside: the vesicle that a point is in, -1 in the fluid between, -2 beyond a wall; stress = -pressure I + 2 mu E; limits from outside"
+)
+COLUMNS = {"velocity": ("u", "v"), "pressure": ("p",), "vorticity": ("omega",), "stress": ("s_xx", "s_xy", "s_yx", "s_yy")}
+
+
+def write_fields(path: Path, request: Request, frames: Sequence[FrameFields], attributes: Mapping[str, Any]) -> None:
+    """All frames as HDF5."""
+    shape = request.grids[0].shape if request.grids else (request.size,)
+    with atomic_h5(path) as file:
+        file["t"] = np.array([frame.t for frame in frames])
+        file["frame"] = np.array([frame.frame for frame in frames])
+        if request.grids:
+            file["x"], file["y"] = (np.stack([getattr(grid, axis) for grid in request.grids]) for axis in ("x", "y"))
+        else:
+            file["points"] = request.points
+        for name in ("inside", *request.quantities):
+            values = np.stack([frame.values[name] for frame in frames])
+            file[name] = values.reshape(len(frames), *shape, *values.shape[2:])
+        file.attrs.update({"about": ABOUT, "disturbance": request.disturbance, "tolerance": request.tolerance, **attributes})
+
+
+def write_table(path: Path, request: Request, frames: Sequence[FrameFields]) -> None:
+    """Points of all frames as text, a row each, columns apart by commas."""
+    assert request.points is not None
+    names = ["t", "x", "y", "inside", *(column for name in request.quantities for column in COLUMNS[name])]
+    rows = []
+    for frame in frames:
+        columns = [np.full(request.size, frame.t), *request.points.T, frame.values["inside"]]
+        for name in request.quantities:
+            columns += list(frame.values[name].reshape(request.size, -1).T)
+        rows.append(np.stack(columns, axis=-1))
+    text = io.StringIO()
+    text.write(f"# {ABOUT}\n{','.join(names)}\n")
+    form = ["%.17g", "%.17g", "%.17g", "%d", *("%.17g",) * (len(names) - 4)]
+    np.savetxt(text, np.concatenate(rows), fmt=form, delimiter=",")
+    write_atomically(path, text.getvalue().encode())
+
+
+def read_points(path: Path) -> np.ndarray:
+    """Points (P, 2) of a text file of rows of x and y. Raises ValueError."""
+    try:
+        x = np.loadtxt(path, ndmin=2, delimiter="," if "," in path.read_text(encoding="utf-8") else None)
+    except FileNotFoundError:
+        raise ValueError(f"--points {path} does not exist") from None
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise ValueError(f"--points {path}: {one_line(error)}; expected rows of two numbers, x and y") from None
+    if x.ndim != 2 or x.shape[1] != 2 or not len(x) or not np.isfinite(x).all():
+        raise ValueError(f"--points {path}: {len(x)} rows of {x.shape[-1]} columns; expected rows of two finite numbers, x and y")
+    return x
