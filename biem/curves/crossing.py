@@ -12,6 +12,7 @@ import shapely
 
 from biem.backend import Array, to_numpy
 from biem.curves.fourier import derivative, resample
+from biem.curves.lattice import Lattice
 
 COARSE, FINE = 4, 32  # polygon corners per node: first test, confirmation
 NEIGHBOURS = 3  # nodes of a side of a curve that are close to each other
@@ -30,9 +31,16 @@ def self_crossings(X: Array, shapes: np.ndarray | None = None) -> list[int]:
     return [int(i) for i in suspect if not shapely.is_valid(polygons(X[[i]], FINE)[0])]
 
 
-def pair_crossings(X: Array, shapes: np.ndarray | None = None) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of curves that cross or contain one another. shapes: polygons(X) where they are at hand."""
+def pair_crossings(X: Array, shapes: np.ndarray | None = None, lattice: Lattice | None = None) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of curves that cross or contain one another. shapes: polygons(X) where they are at hand.
+
+    lattice: the images of the curves, in a periodic box: pairs of which any images do, i = j where a curve meets an image of its own.
+    """
     X = to_numpy(X)
+    if lattice is not None:
+        curves, source = lattice.with_images(X, float((_cut(X) + _edge(X)).max()))
+        pairs = source[np.array(pair_crossings(curves), dtype=np.int64).reshape(-1, 2)]
+        return sorted({(int(min(pair)), int(max(pair))) for pair in pairs})
     if X.shape[0] < 2:
         return []
     shapes = polygons(X) if shapes is None else shapes
@@ -49,6 +57,11 @@ def _cut(X: np.ndarray) -> np.ndarray:
     """How far curves may run outside their polygons (M,), at most: twice what chords cut off by the second derivatives at the nodes."""
     X_aa = derivative(derivative(X))
     return 0.25 * np.hypot(X_aa[:, 0], X_aa[:, 1]).max(axis=-1) * (2.0 * np.pi / (COARSE * X.shape[-1])) ** 2
+
+
+def _edge(X: np.ndarray) -> np.ndarray:
+    """Longest distance of neighbouring nodes (M,)."""
+    return np.hypot(*np.moveaxis(X - np.roll(X, 1, axis=-1), 1, 0)).max(axis=-1)
 
 
 def _narrow(X: np.ndarray) -> np.ndarray:

@@ -43,11 +43,17 @@ def grid(shapes: np.ndarray, box: tuple[float, float], gap: float) -> tuple[np.n
 
 
 def random_packing(
-    shapes: np.ndarray, box: tuple[float, float], gap: float, rng: np.random.Generator, region: shapely.Polygon | None = None
+    shapes: np.ndarray,
+    box: tuple[float, float],
+    gap: float,
+    rng: np.random.Generator,
+    region: shapely.Polygon | None = None,
+    periodic: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Centres (M, 2) and angles (M,) of a random packing inside the box, no two membranes closer than `gap`.
 
-    region: a part of the box to stay in, no closer to its boundary than `gap`.
+    region: a part of the box to stay in, no closer to its boundary than `gap`. periodic: the box repeats itself; centres are in it,
+    membranes may reach over its sides, and keep the gap to all images.
 
     Starts from randomly turned vesicles, small enough to turn freely on a square grid; every move may also grow its vesicle, up to full
     size. One vesicle in every other cell of a checkerboard moves at a time: moves in different cells cannot meet. Raises ValueError
@@ -77,6 +83,7 @@ def random_packing(
     corners_each = CORNERS if M <= MANY else CORNERS_OF_MANY
     outline = np.stack([np.asarray(p.exterior.coords.xy) for p in polygons(shapes, max(1, corners_each // shapes.shape[2]))])
     cell = 2.0 * radius + gap
+    around = np.maximum(1, 2 * np.floor(width / (2.0 * cell)).astype(int))  # cells of a periodic box: an even number, or one
     moved = np.zeros(M, dtype=int)
 
     def corners(index: np.ndarray, x: np.ndarray, a: np.ndarray, grown: np.ndarray) -> np.ndarray:
@@ -84,7 +91,13 @@ def random_packing(
         px, py = outline[index, 0], outline[index, 1]
         return np.stack([c * px - s * py + x[:, :1], s * px + c * py + x[:, 1:]], axis=-1)
 
-    now = np.asarray(shapely.polygons(corners(np.arange(M), centers, angles, size)))
+    def cells(x: np.ndarray) -> np.ndarray:
+        if periodic:
+            return np.floor(np.mod(x + offset, width) * around / width).astype(int) % around
+        return np.floor((x + offset) / cell).astype(int)
+
+    outlines = corners(np.arange(M), centers, angles, size)
+    now = np.asarray(shapely.polygons(outlines))
     while moved.mean() < MOVES or size.min() < 1.0:
         if moved.mean() > MOST_MOVES:
             other = 'or use placement = "grid"' if region is None else "or give the walls more room"
@@ -93,7 +106,7 @@ def random_packing(
                 f"lower count, area_fraction or gap, {other}"
             )
         offset = rng.uniform(0.0, 2.0 * cell, size=2)
-        index = np.floor((centers + offset) / cell).astype(int)
+        index = cells(centers)
         active = np.flatnonzero(((index + rng.integers(0, 2, size=2)) % 2 == 0).all(axis=1))
         if len(active) == 0:
             continue
@@ -105,19 +118,42 @@ def random_packing(
         x = centers[chosen] + step[:, None] * rng.normal(scale=radius, size=(len(chosen), 2))
         a = angles[chosen] + step * rng.uniform(-LARGEST_TURN, LARGEST_TURN, size=len(chosen))
         grown = np.minimum(1.0, size[chosen] * rng.uniform(1.0, LARGEST_GROWTH, size=len(chosen)))
+        x = np.mod(x, width) if periodic else x
         new = corners(chosen, x, a, grown)
-        free = (np.floor((x + offset) / cell).astype(int) == index[chosen]).all(axis=1)
-        free &= ((new.min(axis=1) >= 0.5 * gap) & (new.max(axis=1) <= width - 0.5 * gap)).all(axis=1)
+        free = (cells(x) == index[chosen]).all(axis=1)
+        if not periodic:
+            free &= ((new.min(axis=1) >= 0.5 * gap) & (new.max(axis=1) <= width - 0.5 * gap)).all(axis=1)
         candidates = np.asarray(shapely.polygons(new))
         if room is not None:
             free &= shapely.contains_properly(room, candidates)
-        near = cKDTree(x).sparse_distance_matrix(cKDTree(centers), cell, output_type="ndarray")
-        near = near[chosen[near["i"]] != near["j"]]
-        close = shapely.dwithin(candidates[near["i"]], now[near["j"]], gap)
-        free[np.unique(near["i"][close])] = False
+        image, shift = _images(centers, width, cell) if periodic else (np.arange(M), np.zeros((M, 2)))
+        near = cKDTree(x).sparse_distance_matrix(cKDTree(centers[image] + shift), cell, output_type="ndarray")
+        near = near[(chosen[near["i"]] != image[near["j"]]) | shift[near["j"]].any(axis=1)]
+        i, j, shift = near["i"], image[near["j"]], shift[near["j"]]
+        others = now[j]
+        k = np.flatnonzero(shift.any(axis=1))
+        if len(k):
+            own = (chosen[i[k]] == j[k])[:, None, None]  # the image moves and turns as well
+            others[k] = shapely.polygons(np.where(own, new[i[k]], outlines[j[k]]) + shift[k][:, None, :])
+        close = shapely.dwithin(candidates[i], others, gap)
+        free[np.unique(i[close])] = False
         accepted = chosen[free]
         centers[accepted], angles[accepted], size[accepted], now[accepted] = x[free], a[free], grown[free], candidates[free]
+        outlines[accepted] = new[free]
     return centers, angles
+
+
+def _images(centers: np.ndarray, width: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """All images of points in a periodic box that are within reach of it, themselves first: number (Q,) and displacement (Q, 2)."""
+    number, shift = [np.arange(len(centers))], [np.zeros_like(centers)]
+    columns, rows = np.ceil(reach / width).astype(int)
+    for m in range(-columns, columns + 1):
+        for n in range(-rows, rows + 1):
+            d = np.array([m, n]) * width
+            near = np.flatnonzero(((centers + d >= -reach) & (centers + d <= width + reach)).all(axis=1) & bool(m or n))
+            number.append(near)
+            shift.append(np.broadcast_to(d, (len(near), 2)))
+    return np.concatenate(number), np.concatenate(shift)
 
 
 def _slots(M: int, width: np.ndarray) -> tuple[np.ndarray, float]:

@@ -58,6 +58,15 @@ class Monitored(Protocol):
         ...
 
 
+@runtime_checkable
+class Contrasted(Protocol):
+    """What maps of vesicles that contain another fluid offer besides (`membrane.contrast`)."""
+
+    def velocity(self, X: Array, f: Array, u: Array) -> Array:
+        """Of membranes X (M, 2, N), for their own force densities f and outer velocities u (M, 2, N)."""
+        ...
+
+
 @dataclass(frozen=True)
 class MapsRequest:
     """What a scene asks of a maker of maps: `make_maps(request) -> MembraneMaps`.

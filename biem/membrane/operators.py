@@ -114,6 +114,10 @@ class VesicleOperators:
         xp = array_namespace(self.X)
         return xp.matmul(self.T, solve(self.L, self.P))
 
+    def outer(self, u: Array) -> Array:
+        """Velocity (M, 2n, c) that outer velocities u (M, 2n, c) give the membrane: they themselves, where the fluid is the same inside."""
+        return u
+
     def divergence(self, u: Array) -> Array:
         """P u for columns u (M, 2n, c) -> (M, n, c)."""
         xp = array_namespace(self.X)

@@ -30,6 +30,7 @@ class Checkpoint:
     counts: dict[str, int] = field(default_factory=dict)
     run: str = ""  # of the trajectory that it belongs to
     control: dict[str, float] = field(default_factory=dict)  # of adaptive steps: the next dt, and what rounding took from t
+    tracers: np.ndarray | None = None  # (P, 2), not a number where they have left
 
 
 def checkpoint_path(trajectory: Path) -> Path:
@@ -55,7 +56,8 @@ def prepare_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     if not (np.isfinite(t) and all(np.isfinite(a).all() for a in arrays.values())):
         raise ValueError(f"the state at step {checkpoint.step} is not finite: checkpoint {path} is left as it was")
     with atomic_h5(path.with_name(path.name + ".next")) as file:
-        for name, a in {**arrays, "area_0": checkpoint.area_0, "length_0": checkpoint.length_0}.items():
+        others = {} if checkpoint.tracers is None else {"tracers": checkpoint.tracers}
+        for name, a in {**arrays, **others, "area_0": checkpoint.area_0, "length_0": checkpoint.length_0}.items():
             file[name] = a
         if coupling is not None:
             file["coupling"].attrs["t"] = coupling[0]
@@ -89,6 +91,7 @@ def read_checkpoint(path: Path, run: str | None = None) -> Checkpoint:
                     {k: int(v) for k, v in file["counts"].attrs.items()},
                     str(file.attrs["run"]),
                     {k: float(v) for k, v in file["control"].attrs.items()} if "control" in file else {},
+                    file["tracers"][:] if "tracers" in file else None,
                 )
             if run is None or checkpoint.run == run:
                 return checkpoint

@@ -9,13 +9,22 @@ import shapely
 
 from biem.backend import Array, to_numpy
 from biem.curves.crossing import outside_region, pair_crossings, polygons, self_crossings
+from biem.curves.lattice import Lattice
 from biem.errors import NumericalFailure
 
 
 def check_state(
-    X: Array, sigma: Array | None, diagnostics: Mapping[str, float], max_error: float, region: shapely.Polygon | None = None
+    X: Array,
+    sigma: Array | None,
+    diagnostics: Mapping[str, float],
+    max_error: float,
+    region: shapely.Polygon | None = None,
+    lattice: Lattice | None = None,
 ) -> None:
-    """Raises NumericalFailure for values not finite, area or length errors above max_error, membranes that cross or leave the region."""
+    """Raises NumericalFailure for values not finite, area or length errors above max_error, membranes that cross or leave the region.
+
+    lattice: the images, in a periodic box: membranes must not cross these either.
+    """
     values = to_numpy(X)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=(1, 2)))
     if len(bad):
@@ -32,7 +41,9 @@ def check_state(
     crossed = self_crossings(values, shapes)
     if crossed:
         raise NumericalFailure(f"vesicle {crossed[0]} crosses itself")
-    pairs = pair_crossings(values, shapes)
+    pairs = pair_crossings(values, shapes, lattice)
+    if pairs and pairs[0][0] == pairs[0][1]:
+        raise NumericalFailure(f"vesicle {pairs[0][0]} crosses its own image: the periodic box is too small for it")
     if pairs:
         raise NumericalFailure(f"vesicles {pairs[0][0]} and {pairs[0][1]} cross ({len(pairs)} pair(s) in all)")
     out = [] if region is None else outside_region(values, region, shapes)

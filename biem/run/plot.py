@@ -13,6 +13,7 @@ from matplotlib import animation
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from biem.backend import to_numpy
 from biem.curves.curve import centroid, effective_radius
@@ -67,12 +68,20 @@ def _outlines(X: np.ndarray) -> np.ndarray:
     return resample(X, max(LEAST_CORNERS, X.shape[-1])).transpose(0, 2, 1)
 
 
+def _shown(trajectory: Trajectory, frame: int) -> np.ndarray:
+    """Outlines of a frame's vesicles; in a periodic box wrapped into it, with the images that reach into it."""
+    X, lattice = trajectory.X[frame], trajectory.lattice(frame)
+    return _outlines(X if lattice is None else lattice.with_images(X, 0.0, filled=True)[0])
+
+
 def _view(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Centre (F, 2) and half width (2,) of a window of fixed size that holds every frame, moving where that makes it smaller.
 
-    Where there are walls, the window holds the outer one.
+    Where there are walls, the window holds the outer one; a periodic box is the window.
     """
     X = trajectory.X
+    if "periodic" in trajectory.attributes:
+        return np.zeros((len(X), 2)), 0.51 * np.asarray(trajectory.attributes["periodic"][:2])
     walls = trajectory.attributes.get("walls")
     if walls is not None:
         X = np.broadcast_to(walls[0], (len(X), 1, *walls[0].shape))
@@ -91,8 +100,13 @@ def _draw(axes: Any, trajectory: Trajectory, frame: int, center: np.ndarray, hal
     for k, wall in enumerate(trajectory.attributes.get("walls", ())):
         axes.fill(*resample(wall, 2 * wall.shape[-1]), facecolor="none" if k == 0 else WALL, edgecolor=WALL, linewidth=1.5 if k == 0 else 0)
     line = float(np.clip(5.0 * np.ptp(X, axis=2).max() / half[0], 0.1, 0.8))  # thinner where the vesicles are small
-    shapes = PolyCollection(list(_outlines(X)), facecolor=FACE, edgecolor=EDGE, linewidth=line)
+    shapes = PolyCollection(list(_shown(trajectory, frame)), facecolor=FACE, edgecolor=EDGE, linewidth=line)
     axes.add_collection(shapes)
+    if "periodic" in trajectory.attributes:
+        width, height, _ = trajectory.attributes["periodic"]
+        box = Rectangle((-width / 2, -height / 2), width, height, fill=False, edgecolor=WALL, linewidth=1.0)
+        axes.add_patch(box)
+        shapes.set_clip_path(box)
     axes.set_aspect("equal")
     axes.set_xlim(center[0] - half[0], center[0] + half[0])
     axes.set_ylim(center[1] - half[1], center[1] + half[1])
@@ -131,7 +145,7 @@ def _history(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path) ->
         axes[1].semilogy(time[1:], np.maximum(d["error_estimate"][1:], 1e-17), label="position (estimate)")
     axes[1].set_ylabel("relative error of a step,\nbefore correction")
     axes[1].legend(frameon=False)
-    if trajectory.X.shape[1] > 1 or "walls" in trajectory.attributes:
+    if trajectory.X.shape[1] > 1 or trajectory.attributes.keys() & {"walls", "periodic"}:
         axes[2].plot(time, d["min_gap"], color="tab:green")
         axes[2].set_yscale("log" if d["min_gap"].min() < 0.5 * d["min_gap"].max() else "linear")
         axes[2].set_ylabel("smallest gap")
@@ -191,7 +205,7 @@ def _movie(trajectory: Trajectory, time: np.ndarray, unit: str, path: Path, prog
     for file, writer in writers.items():
         with writer.saving(figure, str(file), dpi=90):
             for k in progress(chosen):
-                shapes.set_verts(list(_outlines(trajectory.X[k])))
+                shapes.set_verts(list(_shown(trajectory, k)))
                 axes[0].set_xlim(center[k, 0] - half[0], center[k, 0] + half[0])
                 axes[0].set_ylim(center[k, 1] - half[1], center[k, 1] + half[1])
                 title.set_text(f"{unit} = {time[k]:.2f}" if time[-1] > 1e-2 else f"{unit} = {time[k]:.3e}")

@@ -21,9 +21,12 @@ from tqdm import tqdm
 from biem.backend import count, counting, fft_backend, stage, to_numpy
 from biem.curves.curve import area, bending_energy, length
 from biem.errors import NumericalFailure
+from biem.observe.observables import Observations
+from biem.observe.tracers import Carrier, Tracers, place_tracers
 from biem.ranks import ALONE, Ranks
 from biem.run.checkpoint import Checkpoint
 from biem.run.guard import check_state
+from biem.run.observe import observer_of_run
 from biem.run.output import Output, where_to_resume
 from biem.run.solver import make_stepper, on_device
 from biem.run.trajectory import MONITORED, SCHEMA, Trajectory, one_frame
@@ -46,11 +49,15 @@ class Stopped(Exception):
 
 @dataclass(frozen=True)
 class Run:
-    """What a run leaves: its trajectory, the file it is in (None: memory only), and how often each part of the solver was used."""
+    """What a run leaves: its trajectory, the file it is in (None: memory only), and how often each part of the solver was used.
+
+    observations: the rows that the scene's [observe] asked for; of a run into a file, on the first rank alone.
+    """
 
     trajectory: Trajectory
     path: Path | None
     counts: Counter[str]
+    observations: Observations | None = None
 
 
 def simulate(
@@ -79,11 +86,14 @@ def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progre
     found = ranks.on_root(lambda: where_to_resume(path, resolved, resume, force))
     problem = ranks.together(lambda: build(scene))
     if found is None:
+        tracers = ranks.together(lambda: place_tracers(problem))
         start = Checkpoint(0, State(0.0, problem.X), area(problem.X), length(problem.X), resolved, run=uuid4().hex)
-        earlier = _frame(problem, start.step, start.state, {})
+        start = start if tracers is None else replace(start, tracers=tracers.x)
+        earlier = _frame(problem, start.step, start.state, {}, tracers)
     else:
         start, earlier = found
         _check_same_walls(problem, earlier)
+        tracers = None if start.tracers is None else Tracers(start.tracers, earlier.attributes["tracer_vesicle"])
     stepper = ranks.together(lambda: make_stepper(problem, start.area_0, start.length_0, ranks))
     start = replace(start, state=on_device(start.state, scene, ranks))
     attributes = {
@@ -98,13 +108,18 @@ def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progre
     }
     if problem.walls is not None:
         attributes["walls"] = problem.walls.curves
-    files = Output(problem, path, start, attributes, earlier, resume, ranks)
+    if problem.box is not None:
+        attributes["periodic"] = [problem.box.width, problem.box.height, problem.box.rate]
+    if tracers is not None:
+        attributes["tracer_vesicle"] = tracers.vesicle
+    observer = ranks.together(lambda: observer_of_run(problem, earlier.X[0]))
+    files = Output(problem, path, start, attributes, earlier, resume, ranks, observer)
     with counting() as counts, fft_backend(problem.X.size):
         counts.update(start.counts)
-        loop = _Loop(problem, stepper, start, int(earlier.step[-1]), files, counts, progress and ranks.rank == 0, ranks, enough)
+        loop = _Loop(problem, stepper, start, int(earlier.step[-1]), files, counts, progress and ranks.rank == 0, ranks, enough, tracers)
         loop.run()
     files.close()
-    return Run(files.trajectory() or _frame(problem, loop.step, loop.state, {}), path, counts)
+    return Run(files.trajectory() or _frame(problem, loop.step, loop.state, {}, loop.tracers), path, counts, files.observations())
 
 
 class _Loop:
@@ -121,6 +136,7 @@ class _Loop:
         progress: bool,
         ranks: Ranks,
         enough: Enough | None,
+        tracers: Tracers | None,
     ) -> None:
         self.problem = problem
         self.stepper = stepper
@@ -131,6 +147,8 @@ class _Loop:
         self.counts = counts
         self.progress = progress
         self.enough = enough
+        self.tracers = tracers
+        self.carrier = Carrier(problem)
         self.step = start.step
         self.state = start.state
         self.running = dict(start.running)
@@ -164,6 +182,7 @@ class _Loop:
                 if self.step % every == 0 or last:
                     self._save_frame()
                     last = last or (self.enough is not None and self.ranks.any(self.enough(self.state.t, to_numpy(self.state.X))))
+                self.files.observe(self.state, self.step, last)
                 stopping = self.ranks.any(stop()) and not last
                 if (self.step % checkpoint_every == 0 or last or stopping) and not self.shortened:
                     self._checkpoint()
@@ -223,13 +242,16 @@ class _Loop:
         def attempt() -> StepResult:
             with np.errstate(all="ignore"):  # what is not finite is the guard's to name
                 result = self.stepper.step(self.state, dt)
-            check_state(result.state.X, result.state.sigma, result.diagnostics, self.problem.scene.solver.max_error, self.problem.region)
+            problem, new = self.problem, result.state
+            lattice = None if problem.box is None else problem.box.at(new.t)
+            check_state(new.X, new.sigma, result.diagnostics, problem.scene.solver.max_error, problem.region, lattice)
             return result
 
         return self.ranks.together(attempt)
 
     def _take(self, t_next: float, dt: float, result: StepResult, rejected: int, begin: float) -> None:
         """The step becomes the present state; rejected: steps tried before it; begin: time at which the first of them began."""
+        self.tracers = self._carried(t_next, result.state)
         self.state = replace(result.state, t=t_next)
         self.step += 1
         self.latest = {**result.diagnostics, "dt": dt}
@@ -241,9 +263,17 @@ class _Loop:
             r[name] = r.get(name, 0.0) + value
         r["dt"] = dt
 
+    def _carried(self, t_next: float, new: State) -> Tracers | None:
+        """The tracers after a step; the first process moves them."""
+        old, tracers = self.state, self.tracers
+        if tracers is None:
+            return None
+        with stage("tracers"):
+            return self.ranks.on_root(lambda: self.carrier.carry(tracers, to_numpy(old.X), old.t, to_numpy(new.X), t_next))
+
     def _save_frame(self) -> None:
         with stage("output"):
-            self.files.frame(lambda: _frame(self.problem, self.step, self.state, self.running))
+            self.files.frame(lambda: _frame(self.problem, self.step, self.state, self.running, self.tracers))
         self.running = {}
         self.saved = self.step
 
@@ -256,7 +286,8 @@ class _Loop:
 
     def _checkpoint(self) -> None:
         s, control = self.start, {} if self.controller is None else self.control
-        make = lambda: Checkpoint(self.step, self.state, s.area_0, s.length_0, s.scene, self.running, dict(self.counts), s.run, control)
+        x = None if self.tracers is None else self.tracers.x
+        make = lambda: Checkpoint(self.step, self.state, s.area_0, s.length_0, s.scene, self.running, dict(self.counts), s.run, control, x)
         with stage("output"):
             self.files.checkpoint(make)
 
@@ -295,17 +326,17 @@ def _check_same_walls(problem: Problem, earlier: Trajectory) -> None:
         raise ValueError("the walls are not those of the frames before: restore walls.file, or start anew with --force")
 
 
-def _frame(problem: Problem, step: int, state: State, running: dict[str, float]) -> Trajectory:
+def _frame(problem: Problem, step: int, state: State, running: dict[str, float], tracers: Tracers | None) -> Trajectory:
     X = to_numpy(state.X)
     sigma = None if state.sigma is None else to_numpy(state.sigma)
     diagnostics = {name: running.get(name, 0.0) for name in (*WORST, "dt", "rejected", "repulsion_work")}
     diagnostics |= {name: running[name] for name in MONITORED if name in running}
     diagnostics["bending_energy"] = float(bending_energy(X, problem.scene.physics.kappa_b).sum())
     diagnostics["wall_seconds"] = running.get("seconds", 0.0) / max(1.0, running.get("steps", 0.0))
-    diagnostics["min_gap"] = minimum_gap(X)
+    diagnostics["min_gap"] = minimum_gap(X, None if problem.box is None else problem.box.at(state.t))
     if problem.walls is not None:
         diagnostics["min_gap"] = min(diagnostics["min_gap"], float(problem.walls.distance(X.transpose(0, 2, 1).reshape(-1, 2)).min()))
-    return one_frame(state.t, step, X, sigma, diagnostics)
+    return one_frame(state.t, step, X, sigma, diagnostics, None if tracers is None else tracers.x)
 
 
 @contextmanager

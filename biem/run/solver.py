@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from biem.membrane.contrast import ContrastMaps
 from biem.membrane.maps import LAYERS, ExactMaps, MapsRequest, MembraneMaps
 from biem.observe.instant import repulsion_of
 from biem.ranks import ALONE, Ranks
@@ -42,7 +43,7 @@ def check_device(name: str, key: str = "solver.device") -> int:
 def check_machine(problem: Problem, ranks: Ranks = ALONE) -> None:
     """Raises ValueError, before the first step, for a device, a library or memory that this machine does not have."""
     devices = check_device(problem.scene.solver.device)
-    free = _free_memory()
+    free = free_memory()
     if devices:
         import torch
 
@@ -59,7 +60,7 @@ def check_machine(problem: Problem, ranks: Ranks = ALONE) -> None:
         )
 
 
-def _free_memory() -> float:
+def free_memory() -> float:
     """Bytes of memory that a process can still have."""
     for line in Path("/proc/meminfo").read_text().splitlines():
         if line.startswith("MemAvailable"):
@@ -111,13 +112,15 @@ def _implicit(problem: Problem) -> Stepper:
         repulsion_of(problem),
         problem.scene.output.tension,
         problem.walls,
+        problem.contrast,
+        problem.box,
     )
 
 
 def _split(problem: Problem, ranks: Ranks) -> Stepper:
     scene = problem.scene
     physics, solver = scene.physics, scene.solver
-    maps = _maps(problem)
+    maps = _maps(problem, ranks)
     fields = replace(_fields(scene), precision=solver.dtype, layers=maps.near_layers, offsets=LAYERS)
     return SplitStepper(
         maps,
@@ -129,14 +132,19 @@ def _split(problem: Problem, ranks: Ranks) -> Stepper:
         scene.output.tension,
         ranks,
         walls=problem.walls,
+        contrast=problem.contrast,
+        box=problem.box,
     )
 
 
-def _maps(problem: Problem) -> MembraneMaps:
+def _maps(problem: Problem, ranks: Ranks) -> MembraneMaps:
     """The maps that the scene asks for. Raises ValueError where what makes them is not there, or has not what is asked for."""
     physics, solver, time = problem.scene.physics, problem.scene.solver, problem.scene.time
     kinds = solver.map_kinds
     needed = frozenset(part.name for part in required_maps(problem) if part.needed)
+    if problem.contrast is not None:
+        mine = problem.contrast[ranks.mine(len(problem.X))]
+        return ContrastMaps(physics.kappa_b, physics.mu, solver.operator_points, contrast=mine)
     if all(kinds[slot] == "exact" for slot in needed):
         return ExactMaps(physics.kappa_b, physics.mu, solver.operator_points, solver.dtype)
     try:

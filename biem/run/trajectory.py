@@ -1,7 +1,7 @@
 """Trajectory files: every committed frame stays readable, whenever the writer is killed.
 
 out.h5: t (F,), step (F,), X (F, M, 2, N), sigma (F, M, N) where the solver has a tension, diagnostics/* (F,), walls/* (2, N_k) where
-there are walls, the outer one first, attributes.
+there are walls, the outer one first, tracers (F, P, 2) and tracer_vesicle (P,) where there are tracers, attributes.
 dt, error_estimate and rejected came later: files without them are read as zeros. MONITORED are there in runs by learned maps alone.
 While a run is writing, new frames lie one file each in out.h5.frames/ and are merged into out.h5 from time to time and at the end;
 `read_trajectory` reads both. Every file appears by a rename after a sync.
@@ -18,6 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from biem.curves.lattice import Box, Lattice
 from biem.run.files import atomic_h5, one_line
 
 SCHEMA = 1
@@ -35,7 +36,10 @@ class Trajectory:
     the suspension's; gmres_iterations the most since the last frame; wall_seconds the mean of a step since then; min_gap is at t; dt is
     of the last step; error_estimate the worst since the last frame, zero where there is none; rejected the steps rejected since then.
     MONITORED, where there are any, are the most vesicles in a step since the last frame.
-    attributes["walls"]: the curves (2, N_k) of the walls, where there are any.
+    attributes["walls"]: the curves (2, N_k) of the walls, where there are any. attributes["periodic"]: width, height and shear rate of
+    a periodic box, where there is one; membranes are where they have wandered to.
+    tracers (F, P, 2), where there are any, not a number from where they have left; attributes["tracer_vesicle"] (P,): the vesicle that
+    each is in, -1 for the fluid between.
     """
 
     t: np.ndarray
@@ -44,9 +48,14 @@ class Trajectory:
     sigma: np.ndarray | None
     diagnostics: Mapping[str, np.ndarray]
     attributes: Mapping[str, Any]
+    tracers: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def lattice(self, frame: int) -> Lattice | None:
+        """The images at a frame, in a periodic box."""
+        return Box(*map(float, self.attributes["periodic"])).at(float(self.t[frame])) if "periodic" in self.attributes else None
 
     def until(self, step: int) -> Trajectory:
         """The frames up to a step."""
@@ -58,14 +67,18 @@ class Trajectory:
             X=self.X[keep],
             sigma=None if self.sigma is None else self.sigma[keep],
             diagnostics={name: values[keep] for name, values in self.diagnostics.items()},
+            tracers=None if self.tracers is None else self.tracers[keep],
         )
 
 
-def one_frame(t: float, step: int, X: np.ndarray, sigma: np.ndarray | None, diagnostics: Mapping[str, float]) -> Trajectory:
+def one_frame(
+    t: float, step: int, X: np.ndarray, sigma: np.ndarray | None, diagnostics: Mapping[str, float], tracers: np.ndarray | None = None
+) -> Trajectory:
     """A trajectory of one frame."""
     names = (*DIAGNOSTICS, *(name for name in MONITORED if name in diagnostics))
     values = {name: np.array([diagnostics.get(name, 0.0)], dtype=np.float64) for name in names}
-    return Trajectory(np.array([t]), np.array([step]), X[None], None if sigma is None else sigma[None], values, {})
+    one = lambda a: None if a is None else a[None]
+    return Trajectory(np.array([t]), np.array([step]), X[None], one(sigma), values, {}, one(tracers))
 
 
 def join(parts: list[Trajectory], attributes: Mapping[str, Any]) -> Trajectory:
@@ -77,7 +90,8 @@ def join(parts: list[Trajectory], attributes: Mapping[str, Any]) -> Trajectory:
     names = (*DIAGNOSTICS, *(name for name in MONITORED if any(name in p.diagnostics for p in parts)))
     diagnostics = {name: np.concatenate([p.diagnostics.get(name, np.zeros(len(p))) for p in parts]) for name in names}
     t, step, X = (np.concatenate([getattr(p, name) for p in parts]) for name in ("t", "step", "X"))
-    return Trajectory(t, step, X, sigma, diagnostics, dict(attributes))
+    tracers = None if parts[0].tracers is None else np.concatenate([p.tracers for p in parts])
+    return Trajectory(t, step, X, sigma, diagnostics, dict(attributes), tracers)
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -140,10 +154,13 @@ class TrajectoryWriter:
                 file[name] = getattr(frames, name)
             if frames.sigma is not None:
                 file["sigma"] = frames.sigma
+            if frames.tracers is not None:
+                file["tracers"] = frames.tracers
+                file["tracer_vesicle"] = self.attributes["tracer_vesicle"]
             for name, values in frames.diagnostics.items():
                 file[f"diagnostics/{name}"] = values
             for name, value in self.attributes.items():
-                if name != "walls":
+                if name not in ("walls", "tracer_vesicle"):
                     file.attrs[name] = value
             for k, X in enumerate(self.attributes.get("walls", ())):
                 file[f"walls/{k}"] = X
@@ -179,7 +196,10 @@ def _read(path: Path) -> Trajectory:
             attributes = dict(file.attrs)
             if "walls" in file:
                 attributes["walls"] = tuple(file[f"walls/{k}"][:] for k in range(len(file["walls"])))
-            return Trajectory(t, file["step"][:], file["X"][:], sigma, diagnostics, attributes)
+            tracers = file["tracers"][:] if "tracers" in file else None
+            if tracers is not None:
+                attributes["tracer_vesicle"] = file["tracer_vesicle"][:]
+            return Trajectory(t, file["step"][:], file["X"][:], sigma, diagnostics, attributes, tracers)
     except OSError as error:
         if not path.exists():
             raise FileNotFoundError(f"trajectory {path} does not exist") from None

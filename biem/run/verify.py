@@ -37,7 +37,7 @@ def verify(trajectory: Trajectory) -> list[Check]:
     for name, measure in (("area", area), ("length", length)):
         drift = max(float(np.abs(measure(frame) / measure(X[0]) - 1.0).max()) for frame in X)
         checks.append(Check(f"{name} kept", drift <= limit, f"largest drift {drift:.1e}, allowed {limit:.0e}"))
-    crossed = [k for k in range(len(t)) if self_crossings(X[k]) or pair_crossings(X[k])]
+    crossed = [k for k in range(len(t)) if self_crossings(X[k]) or pair_crossings(X[k], None, trajectory.lattice(k))]
     checks.append(Check("no crossing", not crossed, f"frames {crossed[:5]}" if crossed else "none"))
     if "walls" in trajectory.attributes:
         region = fluid_region(trajectory.attributes["walls"])

@@ -11,10 +11,12 @@ import shapely
 from biem.curves.crossing import fluid_region, outside_region, pair_crossings, polygons, self_crossings
 from biem.curves.curve import area, effective_radius, length, reduced_area
 from biem.curves.fourier import remove_nyquist
+from biem.curves.lattice import Box
 from biem.curves.packing import assemble, grid, random_packing
 from biem.curves.shapes import ellipse, equilibrium, perturbed
 from biem.scene.config import FLOAT32_TOLERANCE, FlowTable, Scene, Solver, Vesicles, time_value
 from biem.scene.flows import BackgroundFlow, capillary_factor, make_flow
+from biem.scene.periodic import box_of, check_domain, check_flow, check_size, in_domain
 from biem.scene.walls import make_walls
 from biem.stokes.walls import Walls
 
@@ -56,6 +58,22 @@ class Problem:
     region: shapely.Polygon | None = None
 
     @property
+    def box(self) -> Box | None:
+        """The periodic box, or None where there is none."""
+        return box_of(self.scene, self.flow)
+
+    @property
+    def interacting(self) -> bool:
+        """Whether a vesicle's force moves vesicles: others, or, in a periodic box, images of its own."""
+        return len(self.X) > 1 or self.scene.domain is not None
+
+    @property
+    def contrast(self) -> np.ndarray | None:
+        """Viscosity inside over outside of every vesicle (M,), or None where it is 1 for all."""
+        values = np.full(len(self.X), self.scene.vesicles.contrast, dtype=np.float64)
+        return None if np.all(values == 1.0) else values
+
+    @property
     def steps(self) -> int:
         """Steps of dt to the horizon; the last one is shorter where dt does not divide it."""
         return max(1, int(np.ceil(self.horizon / self.dt - 1e-9)))
@@ -71,26 +89,38 @@ class Problem:
         return float(np.mean(length(self.X)))
 
 
-def build(scene: Scene) -> Problem:
-    """The problem of a scene. Raises ValueError with one line for what is wrong."""
-    X, notices = (None, ()) if scene.vesicles.file is None else _from_file(scene)
+def build(scene: Scene, X: np.ndarray | None = None) -> Problem:
+    """The problem of a scene. X (M, 2, N): its membranes at t = 0 where they are known, as from a trajectory, whose solver has run already.
+
+    Raises ValueError with one line for what is wrong.
+    """
+    known = X is not None
+    notices: tuple[str, ...] = ()
+    if not known and scene.vesicles.file is not None:
+        X, notices = _from_file(scene)
+    check_domain(scene)
     walls, region, flow = (None, None, None) if scene.walls is None else _between_walls(scene, X)
     if X is None:
         X = _membranes(scene, region)
-    _check_membranes(X, region)
+    _check_membranes(X, region, None if scene.domain is None else Box(*scene.domain.periodic))
     radius = float(np.sqrt(np.mean(area(X)) / np.pi))
     if flow is None:
         flow = _flow(scene, radius)
         if flow.kind == "rotation":
             _check_rotation(X)
-    if flow.kind != "quiescent" or len(X) > 1 or walls is not None:
+    if flow.kind != "quiescent" or len(X) > 1 or walls is not None or scene.domain is not None:
         _check_not_circles(X)
     t_kappa = scene.physics.mu * radius**3 / scene.physics.kappa_b
     units = {"t_gamma": flow.time_scale, "t_kappa": t_kappa}
     dt, dt_min, horizon = _times(scene, units)
     if flow.kind == "custom":
         flow.velocity(X, 0.0)  # it shows here what is wrong with it
-    _check_solver(scene)
+    box = box_of(scene, flow)
+    if box is not None:
+        check_flow(box, flow, horizon)
+    if not known:
+        _check_solver(scene)
+    _check_contrast(scene, len(X))
     points = scene.solver.operator_points
     if points is not None and points < X.shape[-1]:
         raise ValueError(f"solver.operator_points = {points} is below vesicles.points = {X.shape[-1]}: choose at least as many")
@@ -115,6 +145,19 @@ def _check_solver(scene: Scene) -> None:
                 raise ValueError(
                     f'solver.{key} = {value:g} cannot be met in float32: choose at least {FLOAT32_TOLERANCE:g}, or dtype = "float64"'
                 )
+
+
+def _check_contrast(scene: Scene, vesicles: int) -> None:
+    contrast, solver = scene.vesicles.contrast, scene.solver
+    if isinstance(contrast, list) and len(contrast) != vesicles:
+        raise ValueError(
+            f"vesicles.contrast has {len(contrast)} entries for {vesicles} vesicle(s): give one number, or one for each vesicle"
+        )
+    learned = [f"{slot} = {kind}" for slot, kind in solver.map_kinds.items() if kind != "exact"]
+    if learned and not np.all(np.asarray(contrast) == 1.0):
+        raise ValueError(
+            f'vesicles.contrast = {contrast}: networks are for a contrast of 1 ({learned[0]}); take solver.kind = "split" or "implicit"'
+        )
 
 
 def _times(scene: Scene, units: dict[str, float | None]) -> tuple[float, float, float]:
@@ -174,13 +217,14 @@ def _membranes(scene: Scene, region: shapely.Polygon | None) -> np.ndarray:
     one = float(area(outline[None])[0])
     if region is not None and v.placement == "random" and v.box is None:
         return _packed(v, single, outline, one, region)
-    count, box = _count_and_box(v, one)
+    periodic = scene.domain is not None and v.box is None
+    count, box = _count_and_box(in_domain(v, scene.domain.periodic) if scene.domain is not None and periodic else v, one)
     shapes, outlines = _shapes(v, single, count), _shapes(fine, outline, count)
     gap = v.gap * v.length
     if v.placement == "grid":
         centers, angles = grid(outlines, box, gap)
     else:
-        centers, angles = random_packing(outlines, box, gap, np.random.default_rng([v.seed, 1]))
+        centers, angles = random_packing(outlines, box, gap, np.random.default_rng([v.seed, 1]), periodic=periodic)
     corner = (-box[0] / 2, -box[1] / 2) if v.corner is None else v.corner
     return assemble(shapes, centers + np.asarray(corner), angles)
 
@@ -235,7 +279,8 @@ def _count_and_box(v: Vesicles, one: float) -> tuple[int, tuple[float, float]]:
 
 def _from_file(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     v = scene.vesicles
-    unused = [name for name, field in Vesicles.model_fields.items() if name != "file" and getattr(v, name) != field.default]
+    of_shapes = {name: field for name, field in Vesicles.model_fields.items() if name not in ("file", "contrast")}
+    unused = [name for name, field in of_shapes.items() if getattr(v, name) != field.default]
     if unused:
         raise ValueError(f"vesicles.file excludes vesicles.{unused[0]}: the file holds the shapes and where they are")
     path = scene.folder / str(v.file)
@@ -276,7 +321,7 @@ def _from_file(scene: Scene) -> tuple[np.ndarray, tuple[str, ...]]:
     return remove_nyquist(X), tuple(notices)
 
 
-def _check_membranes(X: np.ndarray, region: shapely.Polygon | None) -> None:
+def _check_membranes(X: np.ndarray, region: shapely.Polygon | None, box: Box | None) -> None:
     away = np.abs(X.mean(axis=-1)).max(axis=-1) / np.ptp(X, axis=-1).max()
     if away.max() > FARTHEST:
         raise ValueError(
@@ -286,10 +331,14 @@ def _check_membranes(X: np.ndarray, region: shapely.Polygon | None) -> None:
     crossed = self_crossings(X)
     if crossed:
         raise ValueError(f"vesicle {crossed[0]} crosses itself ({len(crossed)} in all do): give simple closed curves")
-    pairs = pair_crossings(X)
+    if box is not None:
+        check_size(box, X)
+    pairs = pair_crossings(X, None, None if box is None else box.at(0.0))
     if pairs:
         i, j = pairs[0]
-        raise ValueError(f"vesicles {i} and {j} overlap ({len(pairs)} pair(s) in all do): move them apart")
+        which = f"vesicles {i} and {j} overlap" if i != j else f"vesicle {i} overlaps an image of its own"
+        images = "" if box is None else ", images of the periodic box counted"
+        raise ValueError(f"{which} ({len(pairs)} pair(s) in all do{images}): move them apart")
     out = [] if region is None else outside_region(X, region)
     if out:
         raise ValueError(f"vesicle {out[0]} is not between the walls ({len(out)} in all are not): move it into the fluid")

@@ -70,7 +70,8 @@ def _check_keys(table: WallsTable) -> None:
     for key in needed:
         if getattr(table, key) is None:
             raise ValueError(f'walls.kind = "{table.kind}" needs walls.{key}')
-    for key in table.model_fields_set - {*needed, *allowed, *COMMON}:
+    given = {key for key in table.model_fields_set if getattr(table, key) is not None}  # a resolved scene names all keys
+    for key in given - {*needed, *allowed, *COMMON}:
         raise ValueError(f'walls.{key} does not go with walls.kind = "{table.kind}"; it takes ' + ", ".join((*needed, *allowed)))
     strengths = [key for key in ("capillary", "omega", "inner_omega", "u_max") if getattr(table, key) is not None]
     if table.capillary is not None and len(strengths) > 1:

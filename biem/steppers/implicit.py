@@ -8,6 +8,9 @@ With the coupling velocity u_i given, vesicle i is solved exactly by its own den
 
 which is the coupled system right-preconditioned by its exact diagonal blocks, with the velocity as the unknown. GMRES starts from the
 velocity of the present forces, so a step depends on (X^n, sigma^n) alone. Paper, eq. (time_step_sc1); Quaife & Biros (2014).
+
+Where viscosities differ (`membrane.contrast`), u_i is the outer velocity: the blocks see A_i^-1 u_i, and the other vesicles' double
+layers, of the velocities (X_j - X_j^n)/dt with which they answer, are part of O F.
 """
 
 from __future__ import annotations
@@ -20,7 +23,9 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from biem.backend import Array, array_namespace, constant, count, from_numpy, one_blas_thread, parallel_map, stage, to_numpy
 from biem.curves.fourier import read_back, read_back_matrix, resample, resampling_matrix
+from biem.curves.lattice import Box
 from biem.errors import NumericalFailure
+from biem.membrane.contrast import vesicle_operators
 from biem.membrane.maps import operator_points
 from biem.membrane.operators import VesicleOperators, bending_force, membrane_force, relaxation_system
 from biem.membrane.repulsion import Repulsion, work_of
@@ -39,7 +44,8 @@ class ImplicitStepper:
 
     points: nodes of the operators (default 2 N below N = 96); tolerance: GMRES, relative; tension: keep sigma also where no other vesicle
     needs it. The repulsion is taken at X^n, as a background velocity. Walls are part of the coupling: O includes their answer to a force,
-    by their factorised equations, so that no flow passes them at any iteration.
+    by their factorised equations, so that no flow passes them at any iteration. contrast (M,): of the vesicles' viscosities to mu, or
+    None where all are 1. box: a periodic one; then O includes all images, where they are at t^n.
     """
 
     kappa_b: float
@@ -52,11 +58,13 @@ class ImplicitStepper:
     repulsion: Repulsion | None = None
     tension: bool = False
     walls: Walls | None = None
+    contrast: np.ndarray | None = None
+    box: Box | None = None
 
     def step(self, state: State, dt: float) -> StepResult:
         """The state at t + dt. Raises NumericalFailure if GMRES does not reach the tolerance."""
         with one_blas_thread():
-            alone = state.X.shape[0] == 1 and self.walls is None
+            alone = state.X.shape[0] == 1 and self.walls is None and self.box is None
             return self._step_alone(state, dt) if alone else self._step_coupled(state, dt)
 
     def _step_coupled(self, state: State, dt: float) -> StepResult:
@@ -64,14 +72,17 @@ class ImplicitStepper:
         u_inf = 0.0 * X if self.flow is None else self.flow(X, state.t)
         with stage("response"):
             response = self._response(X, dt)
-        coupling = Interaction.build(X, self.mu, self.fields, stored=True, walls=self.walls)
-        repulsive = None if self.repulsion is None else self.repulsion.force(X)
+        lattice = None if self.box is None else self.box.at(state.t)
+        coupling = Interaction.build(X, self.mu, self.fields, slice(None), True, self.walls, self.contrast, lattice)
+        repulsive = None if self.repulsion is None else self.repulsion.force(X, lattice)
         if repulsive is not None:
-            u_inf = u_inf + on_own_curve(X, repulsive, self.mu) + coupling.velocity(repulsive)
+            u_inf = u_inf + on_own_curve(X, repulsive, self.mu) + coupling.velocity(repulsive, 0.0 * X)
 
-        rhs = u_inf + coupling.velocity(response.force_0)
-        guess = rhs if state.sigma is None else u_inf + coupling.velocity(membrane_force(X, state.sigma, self.kappa_b))
-        u, iterations = self._gmres(lambda v: v - coupling.velocity(response.force(v)), rhs, guess, X)
+        velocity_0 = None if self.contrast is None else response.increment_0 / dt
+        velocity_of = lambda v: None if self.contrast is None else response.moved(v) / dt
+        rhs = u_inf + coupling.velocity(response.force_0, velocity_0)
+        guess = rhs if state.sigma is None else u_inf + coupling.velocity(membrane_force(X, state.sigma, self.kappa_b), velocity_0)
+        u, iterations = self._gmres(lambda v: v - coupling.velocity(response.force(v), velocity_of(v)), rhs, guess, X)
         increment = response.increment(u)
         diagnostics = {"gmres_iterations": iterations, **work_of(repulsive, X, increment)}
         return StepResult(State(state.t + dt, X + increment, response.tension(u)), diagnostics)
@@ -79,19 +90,20 @@ class ImplicitStepper:
     def _step_alone(self, state: State, dt: float) -> StepResult:
         """One vesicle: no coupling, one solve; without flow, relaxation alone."""
         xp = array_namespace(state.X)
-        ops = self._operators(state.X)
+        ops = self._operators(state.X, slice(None))
         N = state.X.shape[-1]
-        velocity = ops.bending_velocity()
+        columns = xp.reshape(ops.bending_velocity(), (1, -1, 1))
         if self.flow is not None:
-            velocity = velocity + resample(self.flow(state.X, state.t), ops.X.shape[-1])
-        columns = xp.reshape(velocity, (1, -1, 1))
+            columns = columns + ops.outer(xp.reshape(resample(self.flow(state.X, state.t), ops.X.shape[-1]), (1, -1, 1)))
         increment, tension = relaxation_system(ops, columns, dt, self.tension)
         sigma = None if tension is None else read_back(tension[..., 0], N)
         X = state.X + resample(xp.reshape(increment, ops.X.shape), N)
         return StepResult(State(state.t + dt, X, sigma), {"gmres_iterations": 0})
 
-    def _operators(self, X: Array) -> VesicleOperators:
-        return VesicleOperators(resample(X, operator_points(X.shape[-1], self.points)), self.kappa_b, self.mu)
+    def _operators(self, X: Array, which: slice) -> VesicleOperators:
+        """Of the vesicles `which` among all X."""
+        contrast = None if self.contrast is None else self.contrast[which]
+        return vesicle_operators(resample(X[which], operator_points(X.shape[-1], self.points)), self.kappa_b, self.mu, contrast)
 
     def _response(self, X: Array, dt: float) -> Response:
         """Increment, tension and force of every vesicle as affine functions of its coupling velocity."""
@@ -99,12 +111,12 @@ class ImplicitStepper:
         M, _, N = X.shape
         n = operator_points(N, self.points)
         chunk = max(1, CHUNK_VALUES // (2 * n) ** 2)
-        parts = parallel_map(lambda x: self._response_of(x, dt), [X[start : start + chunk] for start in range(0, M, chunk)])
+        parts = parallel_map(lambda which: self._response_of(X, which, dt), [slice(k, k + chunk) for k in range(0, M, chunk)])
         return Response(*(xp.concat([getattr(p, name) for p in parts], axis=0) for name in Response.__dataclass_fields__))
 
-    def _response_of(self, X: Array, dt: float) -> Response:
+    def _response_of(self, X: Array, which: slice, dt: float) -> Response:
         xp = array_namespace(X)
-        ops = self._operators(X)
+        ops = self._operators(X, which)
         m, _, n = ops.X.shape
         N = X.shape[-1]
         count("coupled_response", m)
@@ -113,7 +125,7 @@ class ImplicitStepper:
         zero = xp.zeros_like(E)
         basis = xp.concat([xp.concat([E, zero], axis=1), xp.concat([zero, E], axis=1)], axis=0)
         own = xp.reshape(ops.bending_velocity(), (m, 2 * n, 1))
-        columns = xp.concat([own, xp.broadcast_to(basis, (m, *basis.shape))], axis=-1)
+        columns = xp.concat([own, ops.outer(xp.broadcast_to(basis, (m, *basis.shape)))], axis=-1)
         increment, tension = relaxation_system(ops, columns, dt, True)
         D, D4 = ops.D, ops.D4
         x_s, y_s = ops.tangent[:, 0, :, None], ops.tangent[:, 1, :, None]
@@ -183,9 +195,13 @@ class Response:
         """Linear part of the force (M, 2, N)."""
         return _apply(self.force_1, u, self.force_0.shape)
 
+    def moved(self, u: Array) -> Array:
+        """Linear part of the increment (M, 2, N)."""
+        return _apply(self.increment_1, u, self.increment_0.shape)
+
     def increment(self, u: Array) -> Array:
         """X^{n+1} - X^n (M, 2, N)."""
-        return self.increment_0 + _apply(self.increment_1, u, self.increment_0.shape)
+        return self.increment_0 + self.moved(u)
 
     def tension(self, u: Array) -> Array:
         """sigma^{n+1} (M, N)."""

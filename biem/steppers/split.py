@@ -7,6 +7,9 @@
 Two pair sums a step, where there is more than one vesicle. The rate a^n of the velocity at the nodes serves the prediction (with the
 last tension merely carried over, an error of first order stays that no extrapolation removes) and makes the advection of second
 order (Adams-Bashforth); the splitting and the relaxation are of first order. Paper, Algorithm 1, where neither is done.
+
+Where viscosities differ (`membrane.contrast`), u is the outer velocity, to which the other vesicles' double layers belong; they are taken
+with the velocities A_j^-1 (S_j f_j + u_j) that go with the forces in the same sum.
 """
 
 from __future__ import annotations
@@ -14,8 +17,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from biem.backend import Array, Latest, array_namespace, one_blas_thread, stage
-from biem.membrane.maps import MembraneMaps, Monitored
+from biem.curves.lattice import Box
+from biem.membrane.maps import Contrasted, MembraneMaps, Monitored
 from biem.membrane.operators import bending_force, tension_force
 from biem.membrane.repulsion import Repulsion, work_of
 from biem.ranks import ALONE, Ranks
@@ -47,7 +53,8 @@ class SplitStepper:
     """Parameters of the step. flow: background velocity, or None in a fluid at rest; walls: their answer is one more explicit velocity.
 
     tension: keep sigma also where no other vesicle needs it; ranks: processes that share the vesicles; interacting: whether the vesicles
-    are in one fluid, or each in a fluid of its own, a batch of independent runs.
+    are in one fluid, or each in a fluid of its own, a batch of independent runs. contrast (M,): of the vesicles' viscosities to mu, or
+    None where all are 1; otherwise the maps are `Contrasted`, of the vesicles of this rank. box: a periodic one, whose images also act.
     """
 
     maps: MembraneMaps
@@ -60,6 +67,8 @@ class SplitStepper:
     ranks: Ranks = ALONE
     interacting: bool = True
     walls: Walls | None = None
+    contrast: np.ndarray | None = None
+    box: Box | None = None
     _advection: Latest = field(default_factory=Latest, init=False, repr=False, compare=False)
 
     def step(self, state: State, dt: float) -> StepResult:
@@ -108,7 +117,8 @@ class SplitStepper:
         X_mine = X[self.ranks.mine(M)]
         gather = lambda function: self.ranks.gather(M, function)
         u_inf = 0.0 * X if self.flow is None else self.flow(X, state.t)
-        repulsive = None if self.repulsion is None else self.repulsion.force(X)
+        lattice = None if self.box is None else self.box.at(state.t)
+        repulsive = None if self.repulsion is None else self.repulsion.force(X, lattice)
         if repulsive is not None:
             u_inf = u_inf + on_own_curve(X, repulsive, self.mu)
         sigma = None
@@ -123,31 +133,44 @@ class SplitStepper:
                     return -(self_tension + gather(lambda mine: self.maps.flow_tension(X_mine, u[mine])))
 
         if coupled:
-            own_force = bending_force(X, self.kappa_b) + (0.0 if repulsive is None else repulsive)
-            interaction = Interaction.build(X, self.mu, self.fields, self.ranks.mine(M), walls=self.walls)
-            velocity = lambda sigma: u_inf + gather(lambda mine: interaction.velocity(own_force + tension_force(X, sigma)))
+            bending = bending_force(X, self.kappa_b)
+            own_force = bending + (0.0 if repulsive is None else repulsive)
+            around = self.walls, self.contrast, lattice
+            interaction = Interaction.build(X, self.mu, self.fields, self.ranks.mine(M), False, *around)
+
+            def velocity(sigma: Array, u: Array) -> Array:
+                tense = tension_force(X, sigma)
+                moving = None
+                if self.contrast is not None:
+                    maps, f = self.maps, bending + tense
+                    assert isinstance(maps, Contrasted)
+                    moving = gather(lambda mine: maps.velocity(X_mine, f[mine], u[mine]))
+                return u_inf + gather(lambda mine: interaction.velocity(own_force + tense, moving))
+
             if state.coupling is None:
                 u, sigma = _fixed_point(tension, velocity, u_inf)
             else:
                 t_before, u_before, rate = state.coupling
-                sigma = tension(velocity(tension(u_before + (state.t - t_before) * rate)))
-                u = velocity(sigma)
+                u = u_before + (state.t - t_before) * rate
+                u = velocity(tension(u), u)
+                sigma = tension(u)
+                u = velocity(sigma, u)
         elif self.tension:
             sigma = tension(u)
         rate = 0.0 * u if state.coupling is None else (u - state.coupling[1]) / (state.t - state.coupling[0])
         return _Advection(X_mine, u, rate, sigma, repulsive)
 
     def _coupled(self, X: Array) -> bool:
-        """Whether a vesicle's force comes back to a vesicle: from another one, or from the walls."""
-        return self.walls is not None or (self.interacting and X.shape[0] > 1)
+        """Whether a vesicle's force comes back to a vesicle: from another one, from the walls, or from images."""
+        return self.walls is not None or self.box is not None or (self.interacting and X.shape[0] > 1)
 
 
-def _fixed_point(tension: Callable[[Array], Array], velocity: Callable[[Array], Array], u: Array) -> tuple[Array, Array]:
+def _fixed_point(tension: Callable[[Array], Array], velocity: Callable[[Array, Array], Array], u: Array) -> tuple[Array, Array]:
     """Velocity and tension of all vesicles by iteration from u, where there is nothing to predict them from."""
     xp = array_namespace(u)
     for _ in range(FIRST_SWEEPS):
         sigma = tension(u)
-        before, u = u, velocity(sigma)
+        before, u = u, velocity(sigma, u)
         if float(xp.max(xp.abs(u - before))) <= FIRST_CHANGE * float(xp.max(xp.abs(u))):
             break
     return u, sigma

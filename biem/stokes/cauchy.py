@@ -7,11 +7,10 @@ In complex notation (w on the curve, n its outward normal, tau the density, z th
 Each C[f] is holomorphic on either side of the curve; its boundary values v_k at the nodes come from the singular integral with the
 singularity subtracted (a fixed matrix), and its values and derivatives at targets from the barycentric quotients
 
-    v(z) = c(z) sum_k (v_k/c_k) p_k / S,      v'(z) = c(z) sum_k (v_k - v(z))/(w_k - z) p_k/c_k / S,
-    p_k = c_k w'_k/(w_k - z),   S = sum_k p_k
+    v(z) = sum_k v_k p_k / S,      v'(z) = sum_k (v_k - v(z))/(w_k - z) p_k / S,      p_k = w'_k/(w_k - z)
+    S = sum_k p_k inside, sum_k p_k - i N outside:  1/(2 pi i) int (v(w) - v(z))/(w - z) dw  is 0 inside and -v(z) outside
 
-with c = 1 inside and c(z) = 1/(z - a) outside, for any a inside the curve. Both are taken from the closest node on, so that no digits are
-lost next to it.
+(the second quotient likewise). Both are taken from the closest node on, so that no digits are lost next to it.
 Helsing & Ojala, J. Comput. Phys. 227 (2008); Barnett, Wu & Veerapaneni, SIAM J. Sci. Comput. 37 (2015).
 """
 
@@ -32,15 +31,15 @@ from biem.stokes.kernels import double_layer
 
 NEAR = 8.0  # node spacings: beyond, the trapezoid rule errs by exp(-2 pi NEAR), more on the hollow side of a bend
 CHUNK = 1 << 20  # pairs of one temporary
+LOOPS = "biem.stokes.cauchy_loop"
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One closed counterclockwise curve X (2, N), seen by targets inside or outside of it; a (2,): a point inside the curve."""
+    """One closed counterclockwise curve X (2, N), seen by targets inside or outside of it."""
 
     X: np.ndarray
     inside: bool
-    a: np.ndarray
 
     @cached_property
     def center(self) -> np.ndarray:
@@ -97,15 +96,14 @@ class Curve:
         """D[tau] (P, 2) at points (P, 2) on the curve's side of the targets. tau: (2, N)."""
         reach = (NEAR * self.ds) ** 2
         arrays = [self.X - self.center, self.normal, self.ds * tau, self.w, _complex(self.X_alpha), self.holomorphic(tau), reach]
-        a = complex(*(self.a - self.center[:, 0]))
         x = points - from_numpy(self.center[:, 0], like=points)
         if on_cpu(points):
-            loop = compiled("biem.stokes.cauchy_loop").velocity
-            return from_numpy(loop(np.ascontiguousarray(to_numpy(x)), *arrays, self.inside, a), like=points)
-        return velocity_of_arrays(x, [from_numpy(f, like=points) for f in arrays], self.inside, a)
+            loop = compiled(LOOPS).velocity
+            return from_numpy(loop(np.ascontiguousarray(to_numpy(x)), *arrays, self.inside), like=points)
+        return velocity_of_arrays(x, [from_numpy(f, like=points) for f in arrays], self.inside)
 
 
-def velocity_of_arrays(x: Array, arrays: Sequence[Array], inside: bool, a: complex) -> Array:
+def velocity_of_arrays(x: Array, arrays: Sequence[Array], inside: bool) -> Array:
     """D (P, 2) at x (P, 2) in chunks of targets, for any array library and device; `cauchy_loop.velocity` is the same compiled.
 
     arrays: nodes Y, normal, g = tau ds, each (2, N); w, w_alpha (N,); boundary values v (3, N); reach (N,), the squared distance below
@@ -121,30 +119,78 @@ def velocity_of_arrays(x: Array, arrays: Sequence[Array], inside: bool, a: compl
         D_xx, D_xy, D_yy = double_layer(r[:, 0], r[:, 1], normal[0], normal[1])
         far = xp.stack([xp.sum(D_xx * g[0] + D_xy * g[1], axis=-1), xp.sum(D_xy * g[0] + D_yy * g[1], axis=-1)], axis=-1)
         near = xp.any(dot(r, r) < reach, axis=-1)
-        z = x[part][near]
-        far[near] = _close(xp.asarray(z[:, 0] + 1j * z[:, 1], device=device(x)), w, w_alpha, v, inside, a)
+        if bool(xp.any(near)):
+            closest = xp.argmin(dot(r, r)[near], axis=-1)
+            outside = xp.full(closest.shape, not inside, dtype=xp.bool, device=device(x))
+            far[near] = close_velocity(x[part][near], closest, outside, w[None], w_alpha[None], v[None])
         u[part] = far
     return u
 
 
-def _close(z: Array, w: Array, w_alpha: Array, v: Array, inside: bool, a: complex) -> Array:
-    xp = array_namespace(z)
-    r = w[None, :] - z[:, None]
-    c, c_z = (xp.ones_like(w), xp.ones_like(z)) if inside else (1.0 / (w - a), 1.0 / (z - a))
-    closest = xp.argmin(xp.real(r) ** 2 + xp.imag(r) ** 2, axis=-1)
-    V = v / c
-    p = c * w_alpha / r
-    S = xp.sum(p, axis=-1)
-    start = V[:, closest]  # (3, P)
-    change = xp.sum((V[:, None, :] - start[:, :, None]) * p, axis=-1) / S
-    v_z = c_z * (start + change)
-    from_z = v[:, None, :] - v_z[:, :, None]
-    jump = 0.0 * c_z if inside else (z - w[closest]) * c[closest] * c_z  # c at the node less c(z)
-    from_z[:, xp.arange(z.shape[0], device=device(z)), closest] = start * jump - c_z * change
-    of_z = xp.conj(z)[:, None] * from_z[0] - from_z[2]
-    slope = c_z * xp.sum(of_z * p / (c * r), axis=-1) / S
-    u = -0.5 * v_z[0] + xp.conj(0.5 * slope - 0.5 * v_z[1])
+def outer_values(w: Array, w_alpha: Array, f: Array) -> Array:
+    """Limits (V, 3, N) at the nodes, from outside, of C[f] for densities f (V, 3, N) on curves w (V, N); from inside f is to be added.
+
+    The same as `Curve.boundary_values` without the matrices; in float64.
+    """
+    xp = array_namespace(w)
+    f_alpha = derivative(xp.real(f)) + 1j * derivative(xp.imag(f))
+    if on_cpu(w):
+        arrays = (np.ascontiguousarray(to_numpy(a)) for a in (w, w_alpha, f, f_alpha))
+        return _like(compiled(LOOPS).outer_values(*arrays), w)
+    V, N = w.shape
+    diagonal = xp.eye(N, dtype=xp.bool, device=device(w))
+    parts = []
+    step = max(1, CHUNK // N**2)
+    for start in range(0, V, step):
+        part = slice(start, start + step)
+        r = w[part, None, :] - w[part, :, None]
+        quotient = xp.where(diagonal, xp.zeros_like(r), w_alpha[part, None, :] / xp.where(diagonal, xp.ones_like(r), r))
+        sums = xp.matmul(f[part], xp.permute_dims(quotient, (0, 2, 1))) - f[part] * xp.sum(quotient, axis=-1)[:, None, :]
+        parts.append((sums + f_alpha[part]) / (1j * N))
+    return xp.concat(parts, axis=0)
+
+
+def close_velocities(x: Array, closest: Array, outside: Array, curve: Array, w: Array, w_alpha: Array, v: Array) -> Array:
+    """D (Q, 2) at x (Q, 2) beside the nodes `closest` (Q,) of curve[q] among V, each about its centre. w, w_alpha: (V, N), v: (V, 3, N)."""
+    xp = array_namespace(x)
+    if on_cpu(x):
+        arrays = (np.ascontiguousarray(to_numpy(a)) for a in (x, closest, outside, curve, w, w_alpha, v))
+        return from_numpy(compiled(LOOPS).close_velocity(*arrays), like=x)
+    u = xp.empty_like(x)
+    step = max(1, CHUNK // w.shape[-1])
+    for start in range(0, x.shape[0], step):
+        part = slice(start, start + step)
+        j = curve[part]
+        u[part] = close_velocity(x[part], closest[part], outside[part], w[j], w_alpha[j], v[j])
+    return u
+
+
+def close_velocity(x: Array, closest: Array, outside: Array, w: Array, w_alpha: Array, v: Array) -> Array:
+    """D (Q, 2) at x (Q, 2) beside the nodes `closest` (Q,) of their curves, by the quotients; `cauchy_loop.close_velocity` compiled.
+
+    w, w_alpha: (Q, N), v: (Q, 3, N), or of one curve for all (1, ...); outside (Q,): on which side the targets are.
+    """
+    xp = array_namespace(x)
+    N = w.shape[-1]
+    z = xp.asarray(x[:, 0] + 1j * x[:, 1], device=device(x))
+    at_closest = xp.arange(N, device=device(x))[None, :] == closest[:, None]  # (Q, N)
+    r = w - z[:, None]
+    p = w_alpha / r
+    lift = 1j * N * xp.astype(outside, x.dtype)
+    S = xp.sum(p, axis=-1) - lift
+    start = xp.sum(xp.where(at_closest[:, None, :], v, xp.zeros_like(v[0, 0, 0])), axis=-1)  # (Q, 3)
+    change = (xp.sum((v - start[:, :, None]) * p[:, None, :], axis=-1) + lift[:, None] * start) / S[:, None]
+    v_z = start + change
+    from_z = xp.where(at_closest[:, None, :], -change[:, :, None], v - v_z[:, :, None])
+    of_z = xp.conj(z)[:, None] * from_z[:, 0] - from_z[:, 2]
+    slope = xp.sum(of_z * p / r, axis=-1) / S
+    u = -0.5 * v_z[:, 0] + xp.conj(0.5 * slope - 0.5 * v_z[:, 1])
     return xp.stack([xp.real(u), xp.imag(u)], axis=-1)
+
+
+def _like(a: np.ndarray, like: Array) -> Array:
+    """Complex values as an array of the library of `like`, on the CPU."""
+    return a if isinstance(like, np.ndarray) else array_namespace(like).asarray(a)
 
 
 def _complex(f: np.ndarray) -> np.ndarray:

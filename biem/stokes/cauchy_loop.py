@@ -1,4 +1,7 @@
-"""`cauchy.velocity_of_arrays` as a compiled loop, threads over targets. Importing this module loads numba."""
+"""`cauchy.velocity_of_arrays`, `close_velocity` and `outer_values` as compiled loops, threads over targets or curves.
+
+Importing this module loads numba.
+"""
 
 from math import pi
 from typing import Any
@@ -10,7 +13,7 @@ OPTIONS: Any = {"error_model": "numpy", "fastmath": {"contract", "nsz", "reassoc
 
 
 @njit(parallel=True, **OPTIONS)
-def velocity(x: Any, Y: Any, normal: Any, g: Any, w: Any, w_alpha: Any, v: Any, reach: Any, inside: bool, a: complex) -> Any:
+def velocity(x: Any, Y: Any, normal: Any, g: Any, w: Any, w_alpha: Any, v: Any, reach: Any, inside: bool) -> Any:
     """D (P, 2) at x (P, 2): the trapezoid sum, replaced by barycentric quotients where a node is closer than its reach."""
     P, N = x.shape[0], Y.shape[1]
     u = np.empty((P, 2))
@@ -28,36 +31,64 @@ def velocity(x: Any, Y: Any, normal: Any, g: Any, w: Any, w_alpha: Any, v: Any, 
             ux += scale * rx
             uy += scale * ry
         if close:
-            value = _close(complex(x[p, 0], x[p, 1]), closest, w, w_alpha, v, inside, a)
+            value = _close(complex(x[p, 0], x[p, 1]), closest, not inside, w, w_alpha, v)
             u[p, 0], u[p, 1] = value.real, value.imag
         else:
             u[p, 0], u[p, 1] = ux / pi, uy / pi
     return u
 
 
+@njit(parallel=True, **OPTIONS)
+def close_velocity(x: Any, closest: Any, outside: Any, curve: Any, w: Any, w_alpha: Any, v: Any) -> Any:
+    """D (Q, 2) at x (Q, 2) beside the node closest[q] of curve[q] by barycentric quotients. w, w_alpha: (V, N), v: (V, 3, N)."""
+    Q = x.shape[0]
+    u = np.empty((Q, 2))
+    for q in prange(Q):
+        j = curve[q]
+        value = _close(complex(x[q, 0], x[q, 1]), closest[q], outside[q], w[j], w_alpha[j], v[j])
+        u[q, 0], u[q, 1] = value.real, value.imag
+    return u
+
+
+@njit(parallel=True, **OPTIONS)
+def outer_values(w: Any, w_alpha: Any, f: Any, f_alpha: Any) -> Any:
+    """`cauchy.outer_values`: limits (V, 3, N) from outside of the Cauchy integrals of f (V, 3, N) on curves w (V, N)."""
+    V, N = w.shape
+    v = np.empty((V, 3, N), np.complex128)
+    for m in prange(V):
+        for j in range(N):
+            s0, s1, s2 = f_alpha[m, 0, j], f_alpha[m, 1, j], f_alpha[m, 2, j]
+            f0, f1, f2 = f[m, 0, j], f[m, 1, j], f[m, 2, j]
+            for k in range(N):
+                if k != j:
+                    quotient = w_alpha[m, k] / (w[m, k] - w[m, j])
+                    s0 += (f[m, 0, k] - f0) * quotient
+                    s1 += (f[m, 1, k] - f1) * quotient
+                    s2 += (f[m, 2, k] - f2) * quotient
+            v[m, 0, j], v[m, 1, j], v[m, 2, j] = s0 / complex(0.0, N), s1 / complex(0.0, N), s2 / complex(0.0, N)
+    return v
+
+
 @njit(**OPTIONS)
-def _close(z: complex, closest: int, w: Any, w_alpha: Any, v: Any, inside: bool, a: complex) -> complex:
+def _close(z: complex, closest: int, outside: bool, w: Any, w_alpha: Any, v: Any) -> complex:
     N = len(w)
-    inverse = 1.0 + 0j if inside else w[closest] - a  # 1/c at the closest node
-    V0, V1, V2 = v[0, closest] * inverse, v[1, closest] * inverse, v[2, closest] * inverse
-    S, d0, d1, d2 = 0j, 0j, 0j, 0j
+    V0, V1, V2 = v[0, closest], v[1, closest], v[2, closest]
+    S = complex(0.0, -N) if outside else 0j
+    d0, d1, d2 = -S * V0, -S * V1, -S * V2
     for k in range(N):
-        q = w_alpha[k] / (w[k] - z)
-        c = 1.0 + 0j if inside else 1.0 / (w[k] - a)
-        S += c * q
-        d0 += (v[0, k] - c * V0) * q
-        d1 += (v[1, k] - c * V1) * q
-        d2 += (v[2, k] - c * V2) * q
-    c_z = 1.0 + 0j if inside else 1.0 / (z - a)
+        p = w_alpha[k] / (w[k] - z)
+        S += p
+        d0 += (v[0, k] - V0) * p
+        d1 += (v[1, k] - V1) * p
+        d2 += (v[2, k] - V2) * p
     d0, d1, d2 = d0 / S, d1 / S, d2 / S
-    v0, v1, v2 = c_z * (V0 + d0), c_z * (V1 + d1), c_z * (V2 + d2)
-    jump = 0j if inside else (z - w[closest]) / inverse * c_z
+    v0, v1, v2 = V0 + d0, V1 + d1, V2 + d2
     slope = 0j
     z_conj = z.conjugate()
     for k in range(N):
         r = w[k] - z
         change0, change2 = v[0, k] - v0, v[2, k] - v2
         if k == closest:
-            change0, change2 = V0 * jump - c_z * d0, V2 * jump - c_z * d2
+            change0, change2 = -d0, -d2
         slope += (z_conj * change0 - change2) * w_alpha[k] / (r * r)
-    return -0.5 * v0 + (0.5 * c_z * slope / S - 0.5 * v1).conjugate()
+    return -0.5 * v0 + (0.5 * slope / S - 0.5 * v1).conjugate()

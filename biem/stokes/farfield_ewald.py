@@ -157,9 +157,8 @@ def choose_grid(extent: np.ndarray, points: int, pairs: Callable[[float], float]
     return best
 
 
-def pairs_in_squares(x: np.ndarray, extent: np.ndarray) -> Callable[[float], float]:
-    """side -> number of pairs of points x (S, 2), 0 <= x <= extent, that share a square of that side, from a histogram."""
-    finest = 512
+def pairs_in_squares(x: np.ndarray, extent: np.ndarray, finest: int = 512) -> Callable[[float], float]:
+    """side -> number of pairs of points x (S, 2), 0 <= x <= extent, that share a square of that side, from a histogram of finest^2 bins."""
     side = float(extent.max()) / finest
     index = np.minimum((x / side).astype(np.int64), finest - 1)
     H = np.bincount(index[:, 0] * finest + index[:, 1], minlength=finest * finest).reshape(finest, finest).astype(np.float64)

@@ -1,18 +1,23 @@
 """Velocity of vesicles due to all others, on their own nodes: pair sum plus near-field correction, for a fixed geometry. X: (M, 2, N).
 
-Where there are walls, also the flow by which they answer to the vesicles, own ones included, so that the fluid rests on them.
+Where there are walls, also the flow by which they answer to the vesicles, own ones included, so that the fluid rests on them. Vesicles
+of another viscosity than the fluid's, contrast lambda_j, also act by a double layer of density (1 - lambda_j) u_j, u_j their velocity.
+In a periodic box the others are all images of all vesicles, own ones included (biem.stokes.farfield_periodic).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from biem.backend import Array, array_namespace, from_numpy, stage, to_numpy
 from biem.curves.curve import arclength_weights, length
+from biem.curves.lattice import Lattice
+from biem.stokes.double_layers import DoubleLayers
 from biem.stokes.farfield import PairSum, pair_sum
 from biem.stokes.near import apply_rows, near_correction, near_width
 from biem.stokes.near_layers import METHODS, NearLayers
@@ -58,6 +63,42 @@ class NearRows:
 
 
 @dataclass(frozen=True)
+class OfImages:
+    """The correction by curves that are images of others: source (M + I,), see `Lattice.with_images`."""
+
+    inner: Correction
+    source: Array
+
+    def add(self, u: Array, f: Array) -> Array:
+        return self.inner.add(u, f[self.source])
+
+
+@dataclass(frozen=True)
+class ContrastSources:
+    """Double layers of the vesicles whose contrast is not 1, at the targets of an interaction."""
+
+    which: Array  # their indices among all vesicles
+    factor: Array  # 1 - contrast of each, (., 1, 1)
+    layers: DoubleLayers
+
+    @classmethod
+    def build(cls, X: Array, targets: Array, owner: Array, fields: Fields, contrast: np.ndarray) -> ContrastSources:
+        """contrast (M,): not 1 everywhere. Targets skip the curve owner (P,)."""
+        index = np.flatnonzero(contrast != 1.0)
+        place = np.full(len(contrast) + 1, -1)  # the last one: of what no vesicle owns
+        place[index] = np.arange(len(index))
+        which = from_numpy(index, like=X)
+        Y, skip = X[which], from_numpy(place, like=X)[owner]
+        pairs = find_near(Y, targets, 0.0 if fields.near_field == "none" else near_width("upsample", fields.near_tolerance), skip)
+        factor = from_numpy(1.0 - contrast[index], like=X)[:, None, None]
+        return cls(which, factor, DoubleLayers.build(Y, targets, pairs, skip))
+
+    def velocity(self, u: Array) -> Array:
+        """(P, 2) for velocities u (M, 2, N) of all vesicles."""
+        return self.layers.velocity(self.factor * u[self.which])
+
+
+@dataclass(frozen=True)
 class Interaction:
     """Velocity (m, 2, N) of the vesicles `mine` due to all others, and to the walls' answer to all."""
 
@@ -67,13 +108,29 @@ class Interaction:
     nodes: Array  # of the vesicles `mine` (m N, 2)
     precision: str
     walls: Walls | None = None
+    contrast: ContrastSources | None = None
 
     @classmethod
     def build(
-        cls, X: Array, mu: float, fields: Fields, mine: slice = slice(None), stored: bool = False, walls: Walls | None = None
+        cls,
+        X: Array,
+        mu: float,
+        fields: Fields,
+        mine: slice = slice(None),
+        stored: bool = False,
+        walls: Walls | None = None,
+        contrast: np.ndarray | None = None,
+        lattice: Lattice | None = None,
     ) -> Interaction:
-        """For vesicles X (M, 2, N); stored: keep the near rows, as an iterative solver needs them."""
+        """For vesicles X (M, 2, N); stored: keep the near rows, as an iterative solver needs them. contrast (M,), or None where all are 1.
+
+        lattice: the images, in a periodic box; it goes without walls and contrasts.
+        """
         xp = array_namespace(X)
+        if lattice is not None:
+            assert walls is None
+            assert contrast is None
+            X = lattice.wrapped_curves(X)
         M, _, N = X.shape
         index = np.arange(M)[mine]
         nodes = targets = xp.reshape(xp.permute_dims(X[mine], (0, 2, 1)), (len(index) * N, 2))
@@ -88,13 +145,18 @@ class Interaction:
         with stage("far"):
             points = lower(targets - origin), lower(X - origin[None, :, None])
             of = M * N + targets.shape[0] - nodes.shape[0]
-            far = pair_sum(*points, mu=mu, exclude=owner, far_field=fields.far_field, tolerance=fields.far_tolerance, of=of)
+            how = fields.far_field, fields.far_tolerance
+            far = pair_sum(*points, mu, owner, *how, of=of, lattice=lattice)
         with stage("near"):
-            near = _near(X, targets, owner, mu, fields, stored)
-        return cls(arclength_weights(X)[:, None, :], far, near, nodes, fields.precision, walls)
+            near = (_near if lattice is None else partial(_near_images, lattice))(X, targets, owner, mu, fields, stored)
+        sources = None
+        if contrast is not None:
+            with stage("double layers"):
+                sources = ContrastSources.build(X, targets, owner, fields, contrast)
+        return cls(arclength_weights(X)[:, None, :], far, near, nodes, fields.precision, walls, sources)
 
-    def velocity(self, f: Array) -> Array:
-        """(m, 2, N) for force densities f (M, 2, N) of all vesicles."""
+    def velocity(self, f: Array, u_own: Array | None = None) -> Array:
+        """(m, 2, N) for force densities f and, where there is a contrast, velocities u_own (M, 2, N) of all vesicles."""
         xp = array_namespace(f)
         with stage("far"):
             u = self.far.velocity(xp.astype(f * self.weights, getattr(xp, self.precision), copy=False))
@@ -102,11 +164,26 @@ class Interaction:
         with stage("near"):
             for correction in self.near:
                 u = correction.add(u, f)
+        if self.contrast is not None:
+            assert u_own is not None
+            with stage("double layers"):
+                u = u + self.contrast.velocity(u_own)
         if self.walls is not None:
             P = self.nodes.shape[0]
             with stage("walls"):
                 u = u[:P] + self.walls.answer(self.nodes, u[P:])
         return xp.permute_dims(xp.reshape(u, (-1, f.shape[-1], 2)), (0, 2, 1))
+
+
+def _near_images(
+    lattice: Lattice, X: Array, targets: Array, owner: Array, mu: float, fields: Fields, stored: bool
+) -> tuple[Correction, ...]:
+    """`_near` by all images of the wrapped curves X that come close to one of them."""
+    scheme = "upsample" if fields.near_field in METHODS else near_scheme(fields.near_field)
+    lengths = to_numpy(length(X))
+    reach = near_width(scheme, fields.near_tolerance) * float(lengths.max(initial=0.0, where=np.isfinite(lengths))) / X.shape[-1]
+    curves, source = lattice.with_images(X, reach)
+    return tuple(OfImages(correction, source) for correction in _near(curves, targets, owner, mu, fields, stored))
 
 
 def _near(X: Array, targets: Array, owner: Array, mu: float, fields: Fields, stored: bool) -> tuple[Correction, ...]:

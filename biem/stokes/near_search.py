@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 from biem.backend import Array, array_namespace, compiled, count, on_cpu, to_numpy
 from biem.curves.curve import center_of_nodes, length
 from biem.curves.fourier import coefficients, evaluate, resample
+from biem.curves.lattice import Lattice
 
 LOOPS = "biem.stokes.near_loop"
 SEARCH_REFINEMENT = 4  # nodes in the cells per node of the curve
@@ -78,10 +79,20 @@ def locate(X: Array, targets: Array, target: Array, vesicle: Array, alpha: Array
     return _locate(float64(X), float64(targets), target, vesicle, float64(alpha), _newton_compiled)
 
 
-def minimum_gap(X: Array) -> float:
-    """Smallest distance of a node to another curve (M, 2, N); infinite where there are no two curves."""
+def minimum_gap(X: Array, lattice: Lattice | None = None) -> float:
+    """Smallest distance of a node to another curve (M, 2, N); infinite where there are no two curves.
+
+    lattice: the images of the curves, in a periodic box: the distance to an image, also of the node's own curve, counts as well.
+    """
     X = float64(to_numpy(X))
     X = X[np.isfinite(_lengths(X))]
+    if lattice is not None:
+        reach, farthest = float(_lengths(X).max(initial=0.0)), lattice.width + lattice.height
+        while True:
+            gap = minimum_gap(lattice.with_images(X, reach)[0])
+            if gap <= reach or not reach < farthest:
+                return gap
+            reach *= 2.0
     M, _, N = X.shape
     if M < 2:
         return inf

@@ -45,7 +45,7 @@ class Walls:
 
     @cached_property
     def parts(self) -> tuple[Curve, ...]:
-        return tuple(Curve(X, k == 0, a) for k, (X, a) in enumerate(zip(self.curves, self.centers, strict=True)))
+        return tuple(Curve(X, k == 0) for k, X in enumerate(self.curves))
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -63,9 +63,9 @@ class Walls:
         """(K-1, 3, 2P): lambda_x, lambda_y and xi of every body from the density [tau_x; tau_y]."""
         P = len(self.nodes)
         rows = np.zeros((len(self.curves) - 1, 3, 2, P))
-        for row, part, here in zip(rows, self.parts[1:], self.slices[1:], strict=True):
+        for row, part, here, a in zip(rows, self.parts[1:], self.slices[1:], self.centers[1:], strict=True):
             weight = 4.0 * pi * self.mu * part.ds / part.ds.sum()
-            r = part.X - part.a[:, None]
+            r = part.X - a[:, None]
             row[0, 0, here] = row[1, 1, here] = weight
             row[2, 0, here], row[2, 1, here] = -weight * r[1], weight * r[0]
         return rows.reshape(-1, 3, 2 * P)
