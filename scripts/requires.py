@@ -52,6 +52,7 @@ EVIDENCE = {  # of each part: counters, of `biem.backend.count` and of the calls
     "vesicle-vesicle coupling": ("pair sums among vesicles",),
     "far field": ("pair_sum", "ewald_sum"),
     "near field": ("call of the near search", "near_sums", "near_rows", "near_layers"),
+    "viscosity contrast": ("contrast_matrix", "double_layer_matrix", "double_layer_sum"),
     "repulsion": ("call of the repulsion", "repulsed_nodes"),
     "area and length correction": ("call of the area and length correction", "area_length_restored"),
     "redistribution of nodes": ("call of the redistribution", "redistributed"),
@@ -64,7 +65,7 @@ DEMANDED = {"near field": ("near_sums", "near_rows", "near_layers"), "map near":
 NEAR_NETWORK = "near_networks_loaded"
 RAN, READY, UNNEEDED = "ran", "not called", "not needed"
 MARKS = {RAN: "x", READY: "o", UNNEEDED: ""}
-IN_SOLVERS = ("relaxation", "response", "advection", "self-tension", "flow tension", "far", "near", "walls")
+IN_SOLVERS = ("relaxation", "response", "advection", "self-tension", "flow tension", "far", "near", "double layers", "walls")
 STAGES = (*IN_SOLVERS, "redistribution", "area and length")
 MEGABYTE = 1e6
 

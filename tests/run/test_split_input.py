@@ -112,7 +112,7 @@ def test_ewald_without_finufft_names_the_extra_and_auto_does_without(tmp_path):
 
 def test_memory_that_does_not_fit_is_told_before_anything_is_written(tmp_path, monkeypatch):
     needed = memory_estimate(build(scene_of(PAIR, solver=SPLIT)))
-    monkeypatch.setattr(solver, "_free_memory", lambda: 0.5 * needed)
+    monkeypatch.setattr(solver, "free_memory", lambda: 0.5 * needed)
     result = cli("run", write_scene(tmp_path, PAIR), "-o", tmp_path / "out.h5", *settings(SPLIT))
     message = the_error(result, 2)
     assert "2 vesicles of 16 nodes" in message
@@ -125,5 +125,5 @@ def test_memory_that_does_not_fit_is_told_before_anything_is_written(tmp_path, m
 def test_memory_that_just_fits_is_no_error(monkeypatch):
     scene = scene_of(PAIR, solver=SPLIT)
     needed = memory_estimate(build(scene))
-    monkeypatch.setattr(solver, "_free_memory", lambda: 1.01 * needed)
+    monkeypatch.setattr(solver, "free_memory", lambda: 1.01 * needed)
     assert len(simulate(scene).trajectory) == 7

@@ -31,6 +31,7 @@ REFUSED = {
     "vesicles.box": "[1.0] | [1.0, inf]",
     "vesicles.corner": "[0.0]",
     "vesicles.gap": "-0.1 | nan",
+    "vesicles.contrast": '0 | -2 | [1.0, 0.0] | [] | true | "a" | inf',
     "flow.kind": '"sheer"',
     "flow.rate": '"fast" | nan',
     "flow.u_max": "inf",
@@ -56,6 +57,7 @@ REFUSED = {
     "walls.obstacles.aspect": "0.0 | 1.5",
     "walls.obstacles.sides": "2 | 3.5",
     "walls.obstacles.omega": "nan",
+    "domain.periodic": '2.0 | [2.0] | [2.0, 0] | [-1.0, 1.0] | [1.0, inf] | [1.0, 2.0, 3.0] | ["1", 2.0] | "x" | [true, 2.0]',
     "time.dt": '0 | -1e-4 | nan | inf | true | [1] | "0.01 furlongs" | "t_gamma" | "1 2 t_gamma" | "" | "-1 t_gamma" | "nan"',
     "time.horizon": '0 | -1.0 | "inf t_kappa" | inf',
     "time.save_every": "0 | 2.5",
@@ -88,6 +90,9 @@ REFUSED = {
     "output.trajectory": "5",
     "output.checkpoint_every": "0",
     "output.tension": "3",
+    "observe.every": "0 | 1.5",
+    "observe.quantities": '"stress" | [3]',
+    "observe.bins": "0 | 2.5",
 }
 
 

@@ -211,14 +211,14 @@ import re, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from test_plan import crowd
-from biem.__main__ import _seconds_a_step
+from biem.run.reports import seconds_a_step
 from biem.scene.plan import memory_estimate
 # of this program alone: the ru_maxrss of getrusage starts from that of the process which started it
 peak = lambda: 1024.0 * float(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
-_seconds_a_step(crowd(20))  # libraries loaded, loops compiled
+seconds_a_step(crowd(20))  # libraries loaded, loops compiled
 problem = crowd({M})
 before = peak()
-_seconds_a_step(problem)
+seconds_a_step(problem)
 print(peak() - before, memory_estimate(problem))
 """
 

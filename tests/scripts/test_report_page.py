@@ -3,12 +3,11 @@
 import base64
 import json
 import re
-import shutil
 import time
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from browsers import browser
 from comparison_cases import UNIT, comparison
 from studies import compared as numbers
 from studies import report
@@ -16,8 +15,6 @@ from studies.pictures import draw_all
 
 from biem.curves.fourier import resample
 
-DRIVER = "chromedriver"
-BROWSER = "chromium"
 WIDTHS = (1280, 400)
 PATIENCE = 20.0  # s, for what the page does by itself
 
@@ -87,25 +84,6 @@ def test_pictures(made, tmp_path):
     draw_all(compared, found, tmp_path)
     for name in ("error_time", "paths", "membranes"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000, name
-
-
-@contextmanager
-def browser(folder):
-    """A browser of its own without a head; skips where there is none."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    if not (shutil.which(BROWSER) and shutil.which(DRIVER)):
-        pytest.skip(f"{BROWSER} and {DRIVER} are not installed: apt-get install chromium chromium-driver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which(BROWSER)
-    quiet = ("quic", "background-networking", "component-update", "sync", "gpu")
-    for flag in ("--headless=new", "--no-sandbox", "--no-first-run", *(f"--disable-{name}" for name in quiet), f"--user-data-dir={folder}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(shutil.which(DRIVER)))
-    try:
-        yield driver
-    finally:
-        driver.quit()
 
 
 @pytest.fixture(scope="module")
