@@ -54,7 +54,7 @@ def required_parts(problem: Problem) -> list[Part]:
     )
     how = "explicit, two sums a step" if split else "GMRES over pair sums"
     parts += [
-        Part("vesicle-vesicle coupling", many, f"{M} vesicles{_and_images(problem)}: {how}" if many else "one vesicle"),
+        Part("vesicle-vesicle coupling", many, f"{M} vesicle{'s' * (M > 1)}{_and_images(problem)}: {how}" if many else "one vesicle"),
         _far_field(problem) if many or walled else Part("far field", False, "one vesicle"),
         _near_field(problem) if many or walled else Part("near field", False, "one vesicle"),
         _contrast(problem),
@@ -107,7 +107,8 @@ def _and_images(problem: Problem) -> str:
         return ""
     sheared = "" if box.rate == 0.0 else f", sheared at {box.rate:g}"
     share = float(np.sum(area(problem.X))) / (box.width * box.height)
-    return f" and their images in a box of {box.width:g} x {box.height:g}, filled to {share:.3g}{sheared}"
+    whose = "their" if len(problem.X) > 1 else "its"
+    return f" and {whose} images in a box of {box.width:g} x {box.height:g}, filled to {share:.3g}{sheared}"
 
 
 def _tracers(problem: Problem) -> list[Part]:

@@ -190,7 +190,7 @@ def section(results: Results) -> str:
             *lines,
             "**Why they differ**: here exact operators take steps of order 2, networks those of order 1 where 2e-5 is above "
             f"{LONGEST} t_gamma, and start where the reference came to rest; operators at N = 32 are built at 64 nodes, and networks are "
-            "trained on the converged flow. The paper's VesNet at N = 128 has no counterpart: the shipped networks are for 32 nodes. The flow "
-            "is unbounded, W is only the width of the parabola, as in the paper.",
+            "trained on the converged flow. The paper's VesNet at N = 128 has no counterpart: the shipped networks are for 32 nodes. "
+            "The flow is unbounded, W is only the width of the parabola, as in the paper.",
         ]
     )

@@ -151,7 +151,7 @@ def test_one_vesicle_feels_its_images(tmp_path):
     needed = {part.name: part.why for part in required_parts(build(scene)) if part.needed}
     assert needed["tension"] == "its force moves its own images"
     assert needed["far field"].startswith("periodic Ewald sum of 16 points")
-    coupling = "1 vesicles and their images in a box of 0.6 x 0.45, filled to 0.236, sheared at 1000: explicit, two sums a step"
+    coupling = "1 vesicle and its images in a box of 0.6 x 0.45, filled to 0.236, sheared at 1000: explicit, two sums a step"
     assert needed["vesicle-vesicle coupling"] == coupling
     assert memory_estimate(build(scene)) > memory_estimate(build(scene_with(tmp_path, X, None, solver={"kind": "split"})))
 
