@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import pi
-from pathlib import Path
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from biem.observe.grid import box_around
 from biem.observe.instant import Instant, instant
 from biem.scene.build import Problem
 from biem.scene.config import TracersTable
+from biem.scene.tracers import tracers_from_file
 from biem.stokes.near_search import locate
 
 TOLERANCE = 1e-8  # of forces and velocities
@@ -40,14 +40,13 @@ class Tracers:
 
 
 def place_tracers(problem: Problem) -> Tracers | None:
-    """The tracers of a scene at the start; None where it has none. Raises ValueError for what the table or the file lacks."""
+    """The tracers of a scene at the start; None where it has none. Raises ValueError where there is no place for them."""
     table = problem.scene.tracers
     if table is None:
         return None
-    _check(table)
     still = FlowField(problem, Instant(0.0, problem.X, 0.0 * problem.X[:, 0], 0.0 * problem.X, 0.0 * problem.X))
     if table.file is not None:
-        x = _from_file(problem.scene.folder / table.file)
+        x = tracers_from_file(problem.scene.folder / table.file)
         inside = still.inside(x)
         beyond = np.flatnonzero(inside == WALL)
         if len(beyond):
@@ -142,38 +141,10 @@ def _beside(X: np.ndarray, x: np.ndarray, side: float) -> np.ndarray:
     return X @ at + side * BESIDE * float(length(X[None])[0]) * outwards / np.hypot(*outwards)
 
 
-def _check(table: TracersTable) -> None:
-    if (table.file is None) == (table.count is None):
-        raise ValueError("tracers: give count (and box), or file, one of them")
-    defaults = TracersTable.model_fields
-    unused = [name for name in ("box", "corner", "seed", "region") if getattr(table, name) != defaults[name].default]
-    if table.file is not None and unused:
-        raise ValueError(f"tracers.{unused[0]} goes with count; tracers.file says where they are")
-    if table.box is not None and min(table.box) <= 0.0:
-        raise ValueError(f"tracers.box = {list(table.box)}: both sides must be positive")
-
-
 def _box(table: TracersTable, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Corner and sides (2,) of where tracers are drawn: the table's box, or all of the fluid that there is around the membranes."""
     if table.box is None:
-        if table.corner is not None:
-            raise ValueError("tracers.corner goes with a box")
         x0, y0, x1, y1 = box_around(problem.X, () if problem.walls is None else problem.walls.curves)
         return np.array([x0, y0]), np.array([x1 - x0, y1 - y0])
     sides = np.asarray(table.box)
     return np.asarray(table.corner) if table.corner is not None else -0.5 * sides, sides
-
-
-def _from_file(path: Path) -> np.ndarray:
-    """Points (P, 2) of a text file."""
-    try:
-        x = np.loadtxt(path, ndmin=2)
-    except FileNotFoundError:
-        raise ValueError(f"tracers.file {path} does not exist (paths are relative to the scene)") from None
-    except OSError as error:
-        raise ValueError(f"tracers.file {path} cannot be read: {error}") from None
-    except ValueError as error:
-        raise ValueError(f"tracers.file {path}: {' '.join(str(error).split())}; expected two columns, x and y, apart by spaces") from None
-    if x.shape[1] != 2 or not len(x) or not np.isfinite(x).all():
-        raise ValueError(f"tracers.file {path}: {len(x)} rows of {x.shape[1]} columns; expected rows of two finite numbers, x and y")
-    return x

@@ -17,6 +17,7 @@ from biem.curves.shapes import ellipse, equilibrium, perturbed
 from biem.scene.config import FLOAT32_TOLERANCE, FlowTable, Scene, Solver, Vesicles, time_value
 from biem.scene.flows import BackgroundFlow, capillary_factor, make_flow
 from biem.scene.periodic import box_of, check_domain, check_flow, check_size, in_domain
+from biem.scene.tracers import check_tracers
 from biem.scene.walls import make_walls
 from biem.stokes.walls import Walls
 
@@ -99,6 +100,8 @@ def build(scene: Scene, X: np.ndarray | None = None) -> Problem:
     if not known and scene.vesicles.file is not None:
         X, notices = _from_file(scene)
     check_domain(scene)
+    if not known:
+        check_tracers(scene)
     walls, region, flow = (None, None, None) if scene.walls is None else _between_walls(scene, X)
     if X is None:
         X = _membranes(scene, region)

@@ -13,6 +13,7 @@ from biem.membrane.maps import LAYERS, operator_points
 from biem.membrane.resultants import CPU_CHUNK, DEVICE_CHUNK
 from biem.scene.build import Problem
 from biem.scene.config import Solver
+from biem.scene.tracers import tracers_from_file
 from biem.stokes.farfield import far_field_bytes, far_scheme
 from biem.stokes.near import near_width
 from biem.stokes.near_layers import METHODS
@@ -118,12 +119,10 @@ def _tracers(problem: Problem) -> list[Part]:
 
 
 def _tracer_count(problem: Problem) -> int:
-    """Of those in a file, the number of its lines."""
     table = problem.scene.tracers
     if table is None or table.file is None:
         return 0 if table is None else table.count or 0
-    path = problem.scene.folder / table.file
-    return sum(1 for _ in path.open("rb")) if path.is_file() else 0
+    return len(tracers_from_file(problem.scene.folder / table.file))
 
 
 def _near_name(solver: Solver) -> str:

@@ -15,6 +15,7 @@ from biem.run.simulate import Stopped, simulate
 from biem.run.trajectory import read_trajectory
 from biem.scene.build import build
 from biem.scene.config import make_scene
+from biem.scene.plan import required_parts, trajectory_bytes
 
 SOME = {"tracers": {"count": 12, "box": [0.6, 0.5]}}
 
@@ -141,6 +142,19 @@ def test_tracers_change_nothing_of_the_run_and_cost_nothing_where_there_are_none
     assert without.trajectory.tracers is None
     assert not {"tracer_steps", "field_points", "goursat"} & set(without.counts)
     assert "tracers" not in scene_of(PAIR).model_dump(mode="json")
+
+
+def test_a_plan_tells_of_tracers_and_their_share_of_the_file(tmp_path):
+    np.savetxt(tmp_path / "points.txt", np.zeros((3, 2)))
+    without, drawn, named = (
+        build(scene_of(PAIR, folder=tmp_path, **({"tracers": table} if table else {})))
+        for table in ({}, {"count": 40}, {"file": "points.txt"})
+    )
+    told = [[part.why for part in required_parts(problem) if part.name == "tracers"] for problem in (without, drawn, named)]
+    assert told[0] == []
+    assert told[1][0].startswith("40: ")
+    assert told[2][0].startswith("3: ")
+    assert trajectory_bytes(drawn) - trajectory_bytes(without) == 8 * 2 * 40 * (drawn.steps + 2)
 
 
 def test_other_tracers_are_not_resumed(tmp_path):

@@ -128,13 +128,13 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path, monkeypatch, time):
 def test_a_long_run_keeps_areas_and_gaps_and_paths_have_no_jumps(tmp_path):
     one = ellipse(16, 0.8)
     X = np.stack([place(one, np.array(c), a) for c, a in (((-0.2, -0.05), 1.3), ((0.1, 0.3), 0.2))])
-    done = simulate(scene_with(tmp_path, X, steps=100, dt=DT / 2, solver={"kind": "split"})).trajectory
+    done = simulate(scene_with(tmp_path, X, steps=50, dt=DT, solver={"kind": "split"})).trajectory
     c = done.X.mean(axis=-1)
     assert np.ptp(c[:, :, 0], axis=0).max() > 2 * SIDES[0]  # through the box more than once
-    assert np.abs(np.diff(c, axis=0)).max() < 0.05
+    assert np.abs(np.diff(c, axis=0)).max() < 0.1
     for measure in (area, length):
         assert max(np.abs(measure(frame) / measure(X) - 1).max() for frame in done.X) < 1e-10
-    for k in (0, 50, 100):
+    for k in (0, 25, 50):
         lattice = done.lattice(k)
         assert lattice == Box(*SIDES, RATE).at(done.t[k])
         assert done.diagnostics["min_gap"][k] == minimum_gap(done.X[k], lattice) < minimum_gap(done.X[k]) + 1e-15

@@ -93,6 +93,12 @@ REFUSED = {
     "observe.every": "0 | 1.5",
     "observe.quantities": '"stress" | [3]',
     "observe.bins": "0 | 2.5",
+    "tracers.file": '3 | "missing"',
+    "tracers.count": "0 | 1.5",
+    "tracers.box": "[1.0] | [1.0, inf] | 1.0",
+    "tracers.corner": '[0.0] | [nan, 0.0] | "left"',
+    "tracers.region": '"middle" | 1',
+    "tracers.seed": "-1 | 0.5",
 }
 
 
