@@ -3,8 +3,9 @@
 import h5py
 import numpy as np
 import pytest
-from scene_helpers import PAIR, cli, scene_of, stop_after, table, the_error, write_scene
+from scene_helpers import DT, PAIR, cli, scene_of, stop_after, table, the_error, write_scene
 from scipy.integrate import solve_ivp
+from thread_ranks import on_threads
 
 from biem.backend import counting
 from biem.curves.curve import normal
@@ -142,6 +143,14 @@ def test_tracers_change_nothing_of_the_run_and_cost_nothing_where_there_are_none
     assert without.trajectory.tracers is None
     assert not {"tracer_steps", "field_points", "goursat"} & set(without.counts)
     assert "tracers" not in scene_of(PAIR).model_dump(mode="json")
+
+
+def test_ranks_share_the_tracers_of_the_first_one():
+    scene = scene_of(PAIR, SOME, solver={"kind": "split"}, time={"horizon": 3 * DT})
+    alone = simulate(scene).trajectory
+    for run in on_threads(2, lambda ranks: simulate(scene, ranks=ranks)):
+        assert np.array_equal(run.trajectory.tracers, alone.tracers)
+        assert np.array_equal(run.trajectory.X, alone.X)
 
 
 def test_a_plan_tells_of_tracers_and_their_share_of_the_file(tmp_path):
