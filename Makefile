@@ -9,6 +9,7 @@ READY := .venv/.ready
 DEV := .venv/.dev
 QUICKLY := --quiet --disable-pip-version-check --no-compile  # compiling what is never loaded takes longer than all else
 export OMP_WAIT_POLICY = PASSIVE
+unexport PYTHONDONTWRITEBYTECODE  # where it is set, as images do, each process would compile all that it loads
 
 .PHONY: setup demo dataset docs smoke test lint clean
 setup: $(READY)

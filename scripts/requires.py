@@ -28,7 +28,7 @@ from tqdm import tqdm
 from biem.backend import count, threads, timing
 from biem.cli import one_line_errors
 from biem.errors import NumericalFailure
-from biem.membrane import maps
+from biem.membrane import contrast, maps
 from biem.membrane.repulsion import Repulsion
 from biem.run import simulate as loop
 from biem.run.files import write_atomically
@@ -101,7 +101,7 @@ def watched(kinds_of_maps: Sequence[type]) -> Iterator[None]:
         (interaction, "find_near", "the near search"),
         (corrections, "restore_area_length", "the area and length correction"),
         (corrections, "redistribute", "the redistribution"),
-        *((kind, method, slot) for kind in kinds_of_maps for slot, method in METHODS.items()),
+        *((kind, method, slot) for kind in kinds_of_maps for slot, method in METHODS.items() if method in vars(kind)),
     ]
     with ExitStack() as stack:
         for owner, name, what in entries:
@@ -121,7 +121,7 @@ def watched(kinds_of_maps: Sequence[type]) -> Iterator[None]:
 def _kinds_of_maps(scene: Scene) -> list[type]:
     """What a stepper of the scene may be given as maps; no network's library is loaded for a scene without networks."""
     if scene.solver.kind != "vesnet":
-        return [maps.ExactMaps]
+        return [maps.ExactMaps, contrast.ContrastMaps]
     from surrogate.provider import SlotMaps
 
     return [maps.ExactMaps, SlotMaps]

@@ -106,9 +106,15 @@ class Carrier:
                 x[p] = self._off_the_wall(x[p])
             else:
                 m = vesicle[p] if vesicle[p] != FLUID else inside[p]
-                x[p] = _beside(flow.at.X[m], x[p], -1.0 if vesicle[p] != FLUID else 1.0)
+                near = self._image_at(flow, x[p], m)
+                x[p] += _beside(flow.at.X[m], near, -1.0 if vesicle[p] != FLUID else 1.0) - near
         count("tracers_put_back", int(np.isfinite(x[wrong]).all(axis=1).sum()))
         return x
+
+    def _image_at(self, flow: FlowField, x: np.ndarray, m: int) -> np.ndarray:
+        """The image of the point x (2,) that is at vesicle m, in a periodic box."""
+        box, center = self.problem.box, flow.at.X[m].mean(axis=-1)
+        return x if box is None else center + box.at(flow.at.t).wrapped((x - center)[None])[0]
 
     def _off_the_wall(self, x: np.ndarray) -> np.ndarray:
         """Back in the fluid, or not a number where there is an opening."""

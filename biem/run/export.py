@@ -141,6 +141,8 @@ def write_tracers(path: Path, trajectory: Trajectory, frames: Sequence[int]) -> 
     left = ~np.isfinite(x).all(axis=-1)
     for k in range(1, len(x)):
         x[k][left[k]] = x[k - 1][left[k]]
+    for k, lattice in enumerate(trajectory.lattice(k) for k in range(len(x))):
+        x[k] = x[k] if lattice is None else lattice.wrapped(x[k])
     P = x.shape[1]
     vesicle = np.asarray(trajectory.attributes["tracer_vesicle"])
     data = {"left": left[frames].astype(np.int64), "vesicle": np.tile(vesicle, (len(frames), 1))}

@@ -129,7 +129,8 @@ class Painter:
             axes.fill(*outline, facecolor="none" if k == 0 else WALL, edgecolor=WALL, linewidth=1.5, zorder=3)
         axes.add_collection(LineCollection(_closed(_shown(self.trajectory, frame.frame)), colors=ink, linewidths=1.0, zorder=4))
         if self.trajectory.tracers is not None:
-            axes.plot(*self.trajectory.tracers[frame.frame].T, ".", color="tab:orange", markersize=3, zorder=5)
+            x, lattice = self.trajectory.tracers[frame.frame], self.trajectory.lattice(frame.frame)
+            axes.plot(*(x if lattice is None else lattice.wrapped(x)).T, ".", color="tab:orange", markersize=3, zorder=5)
         axes.set_xlim(*extent[:2])
         axes.set_ylim(*extent[2:])
         time, unit = _times(self.trajectory)

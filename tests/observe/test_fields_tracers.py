@@ -100,6 +100,22 @@ def test_a_tracer_that_the_membrane_passes_over_is_put_back():
     assert 0 < counts["tracers_put_back"] <= 6
 
 
+def test_in_a_periodic_box_a_tracer_is_put_back_to_the_image_that_it_is_at():
+    away = {"vesicles": {"points": 32}, "domain": {"periodic": [0.9, 0.8]}}
+    problem, flow = frozen(away)
+    X, n, step = problem.X, normal(problem.X)[0].T, np.array([[[0.0], [0.03]]])
+    images = np.array([[1.8, 0.0], [-0.9, 0.8], [0.0, -1.6]])
+    near = X[0].T[:3] - 1e-4 * n[:3] + images
+    tracers = Tracers(near, flow.inside(near))
+    assert tracers.vesicle.tolist() == [0, 0, 0]
+    with counting() as counts:
+        moved = Carrier(problem).carry(tracers, X, 0.0, X + step, 1e-9)
+    after = FlowField(problem, instant(problem, X + step, 1e-9))
+    assert after.inside(moved.x).tolist() == [0, 0, 0]
+    assert counts["tracers_put_back"] == 3
+    assert np.abs(moved.x - near).max() < 0.05
+
+
 CHANNEL = {
     "vesicles": {"centers": [[-1.0, 0.0]], "angles": [1.5708], "points": 32, "reduced_area": 0.8},
     "flow": {"kind": None, "rate": None},

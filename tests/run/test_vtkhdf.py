@@ -167,7 +167,7 @@ def test_walls_and_one_frame_and_shapes_alone(tmp_path):
 
 def test_a_periodic_run_is_exported_wrapped(tmp_path):
     moved = {"vesicles": {"centers": [[3.05, 1.0], [3.75, 0.95]]}, "domain": {"periodic": [1.4, 1.0]}}
-    simulate(scene_of(PAIR, moved, time={"horizon": DT}), tmp_path / "out.h5")
+    simulate(scene_of(PAIR, moved, tracers={"count": 6, "box": [9.0, 7.0]}, time={"horizon": DT}), tmp_path / "out.h5")
     assert cli("export", tmp_path / "out.h5", "--vtkhdf", "--shapes", "--quiet").exit_code == 0
     _, data = steps_of(tmp_path / "out.vtkhdf")[0]
     centers = points_of(data)[:, :2].reshape(2, -1, 2).mean(axis=1)
@@ -175,6 +175,10 @@ def test_a_periodic_run_is_exported_wrapped(tmp_path):
     shift = (np.array([[3.05, 1.0], [3.75, 0.95]]) - centers) / [1.4, 1.0]
     assert np.abs(shift - np.round(shift)).max() < 0.1
     assert np.abs(np.round(shift)).max() > 0
+    x, (_, tracers) = read_trajectory(tmp_path / "out.h5").tracers[0], steps_of(tmp_path / "out.tracers.vtkhdf")[0]
+    assert (np.abs(points_of(tracers)[:, :2]) <= [0.7, 0.5]).all()
+    assert np.abs((x - points_of(tracers)[:, :2]) / [1.4, 1.0] % 1.0 - 0.5).min() > 0.5 - 1e-9
+    assert np.abs(x).max() > 1.0
 
 
 def test_an_unfinished_run_is_exported_as_far_as_it_is_committed_and_said_so(tmp_path):
