@@ -14,9 +14,10 @@ from tqdm import tqdm
 
 from biem import __version__
 from biem.cli import fail, first_rank_only, one_line_errors
+from biem.observe.tracers import place_tracers
 from biem.ranks import world
 from biem.run import reports
-from biem.run.files import write_atomically
+from biem.run.files import make_folder, write_atomically
 from biem.run.observe import observe_file, observer_of_run
 from biem.run.simulate import simulate
 from biem.run.trajectory import read_trajectory
@@ -80,7 +81,7 @@ def new(
         text, path = scene_text(name, all_keys), output or Path(f"{name}.toml")
         if path.exists():
             raise ValueError(f"{path} exists: choose another name with -o")
-        path.absolute().parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         write_atomically(path, text.encode())
         typer.echo(f"{path}: run it by `biem run {path}`")
 
@@ -129,6 +130,7 @@ def plan(
     with one_line_errors():
         problem = build(_load(scene, solver, accuracy, weights, overrides))
         observer_of_run(problem, problem.X)  # refuses quantities that the scene does not have
+        place_tracers(problem, most=1)  # and tracers for which it has no place
         report = reports.plan_report(problem, measure and (as_json or not quiet))
         if as_json or not quiet:
             typer.echo(reports.as_json(report) if as_json else "\n".join(reports.plan_lines(report)))

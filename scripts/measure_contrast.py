@@ -172,12 +172,12 @@ def order() -> None:
         for kind in ("implicit", "split"):
             row = [", ".join(f"{c:g}" for c in contrast), kind]
             for way in (1, 2):
-                ends = [simulate(pair(kind, contrast, dt, way, 48)).trajectory.X[-1] for dt in (0.04, 0.02, 0.01)]
+                ends = [simulate(pair(kind, contrast, dt, way, 48)).trajectory.X[-1] for dt in (0.02, 0.01, 0.005)]
                 row.append(" ".join(f"{np.abs(a - b).max() / _radius(a):.1e}" for a, b in pairwise(ends)))
             ends = [resample(simulate(pair(kind, contrast, 0.02, 1, N)).trajectory.X[-1], 96) for N in (24, 32, 48, 64)]
             row.append(" ".join(f"{np.abs(a - b).max() / _radius(a):.1e}" for a, b in pairwise(ends)))
             rows.append(row)
-    table(["contrasts", "solver", "order 1: 0.04-0.02, 0.02-0.01", "order 2", "N: 24-32, 32-48, 48-64"], rows)
+    table(["contrasts", "solver", "order 1: 0.02-0.01, 0.01-0.005", "order 2", "N: 24-32, 32-48, 48-64"], rows)
 
 
 def _radius(X: np.ndarray) -> float:

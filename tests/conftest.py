@@ -3,9 +3,25 @@
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import datagen_fakes
 import pytest
+
+# Files that take longest, handed out first (`--no-loadscope-reorder`), so that none of them is still running alone at the end.
+SLOW = (
+    *("run/test_mpi", "docs/test_site", "surrogate/test_training_processes", "scripts/test_requires", "packaging/test_package"),
+    *("docs/test_examples", "scripts/test_extremes", "run/test_periodic_runs", "faults/test_kill", "scripts/test_compare"),
+    *("surrogate/test_train", "run/test_adaptive", "datagen/test_datagen_ranks", "faults/test_datagen_corruption"),
+    *("parity/test_dense_suspension", "physics/test_known_values", "scene/test_scene_files", "run/test_doctor", "run/test_split_runs"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    """The slow files first, otherwise as they were found."""
+    folder = Path(__file__).parent
+    places = {folder / f"{name}.py": place for place, name in enumerate(SLOW)}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
 
 
 def pytest_addoption(parser):

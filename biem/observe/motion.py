@@ -12,7 +12,6 @@ from biem.scene.build import Problem
 from biem.stokes.near_search import minimum_gap
 from biem.stokes.walls import Walls
 
-AROUND = np.array([(m, n) for n in (-1.0, 0.0, 1.0) for m in (-2.0, -1.0, 0.0, 1.0, 2.0)])  # images that the nearest one is among
 REFINEMENT = 4  # points a node at which the outermost point of a membrane is looked for
 
 
@@ -44,8 +43,7 @@ def pair_distances(c: np.ndarray, lattice: Lattice | None = None) -> np.ndarray:
     i, j = pairs(len(c)).T
     d = c[i] - c[j]
     if lattice is not None:
-        d = lattice.wrapped(d)[:, None, :] + lattice.displacement(AROUND)
-        return np.hypot(*np.moveaxis(d, -1, 0)).min(axis=1)
+        return np.hypot(*np.moveaxis(_in_all_rows(d, lattice), -1, 0)).min(axis=1)
     return np.hypot(*d.T)
 
 
@@ -59,8 +57,19 @@ def nearest_distances(c: np.ndarray, lattice: Lattice | None = None) -> np.ndarr
     points = c
     if lattice is not None:
         c = lattice.wrapped(c)
-        points = (c + lattice.displacement(AROUND)[:, None, :]).reshape(-1, 2)
+        beside = np.array([[-lattice.width, 0.0], [0.0, 0.0], [lattice.width, 0.0]])
+        points = (_in_all_rows(c, lattice)[:, :, None, :] + beside).reshape(-1, 2)
     return np.asarray(cKDTree(points).query(c, k=2)[0])[:, 1]
+
+
+def _in_all_rows(d: np.ndarray, lattice: Lattice) -> np.ndarray:
+    """Of d (P, 2) the image with the least |x| in each row (P, R, 2), for all rows that the one closest to the origin may be in."""
+    reach = 0.5 * np.hypot(lattice.width, lattice.height)  # nothing is further from all of its images
+    most = np.ceil(reach / lattice.height) + 1.0
+    n = np.arange(-most, most + 1.0)
+    rows = lattice.wrapped(d)[:, None, :] + lattice.displacement(np.stack([0.0 * n, n], axis=-1))
+    rows[..., 0] -= lattice.width * np.round(rows[..., 0] / lattice.width)
+    return rows
 
 
 def lateral_distribution(y: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -103,7 +103,7 @@ def _not_shear(problem: Problem) -> str:
 def _no_area(problem: Problem) -> str:
     has = reference_area(problem)[2]
     return _not_shear(problem) or (
-        "" if has else "takes an area of the suspension, which this scene has not: give vesicles.box, or take intrinsic_viscosity"
+        "" if has else "takes an area of the suspension, which only domain.periodic or vesicles.box gives: take intrinsic_viscosity here"
     )
 
 

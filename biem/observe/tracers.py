@@ -28,7 +28,8 @@ from biem.stokes.near_search import locate
 TOLERANCE = 1e-8  # of forces and velocities
 OPENING = 1e-9  # of the largest velocity of the walls: one that moves outwards faster than that lets the fluid out
 BESIDE = 1e-6  # lengths from the membrane where a tracer is put back
-MOST_DRAWS = 10_000  # rounds in which random places are drawn
+MOST_DRAWS = 100_000  # random places for one that is where tracers are asked for
+DRAWN_AT_ONCE = 1000  # at least
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,11 @@ class Tracers:
     vesicle: np.ndarray
 
 
-def place_tracers(problem: Problem) -> Tracers | None:
-    """The tracers of a scene at the start; None where it has none. Raises ValueError where there is no place for them."""
+def place_tracers(problem: Problem, most: int | None = None) -> Tracers | None:
+    """The tracers of a scene at the start, of random ones not more than `most`; None where it has none.
+
+    Raises ValueError where there is no place for them.
+    """
     table = problem.scene.tracers
     if table is None:
         return None
@@ -53,16 +57,19 @@ def place_tracers(problem: Problem) -> Tracers | None:
             raise ValueError(f"tracers.file {table.file}: point {beyond[0]} is not in the fluid: move it between the walls")
         return Tracers(x, inside)
     assert table.count is not None
+    wanted = table.count if most is None else min(table.count, most)
     corner, sides = _box(table, problem)
     rng = np.random.default_rng([table.seed, 2])
     x, inside = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
-    for _ in range(MOST_DRAWS):
-        drawn = corner + sides * rng.random((table.count, 2))
+    tried = 0
+    while tried <= MOST_DRAWS * (1 + len(x)):
+        drawn = corner + sides * rng.random((max(wanted, DRAWN_AT_ONCE), 2))
+        tried += len(drawn)
         at = still.inside(drawn)
-        wanted = (at != WALL) & ((table.region == "all") | ((at == FLUID) == (table.region == "outside")))
-        x, inside = np.concatenate([x, drawn[wanted]]), np.concatenate([inside, at[wanted]])
-        if len(x) >= table.count:
-            return Tracers(x[: table.count], inside[: table.count])
+        here = (at != WALL) & ((table.region == "all") | ((at == FLUID) == (table.region == "outside")))
+        x, inside = np.concatenate([x, drawn[here]]), np.concatenate([inside, at[here]])
+        if len(x) >= wanted:
+            return Tracers(x[:wanted], inside[:wanted])
     raise ValueError(f'tracers: no place for {table.count} of them in the box, region = "{table.region}": choose a box with more of it')
 
 

@@ -22,6 +22,7 @@ from biem.curves.fourier import resample
 from biem.observe.grid import Grid, frames_named, grid_shape
 from biem.run.field_command import box_of
 from biem.run.fields import FrameFields, Request, check_memory, parts_of, quantities_named, remove_parts, sampled
+from biem.run.files import make_folder
 from biem.run.observe import problem_of
 from biem.run.trajectory import Trajectory, read_trajectory
 from biem.run.vtkhdf import write_image, write_polydata
@@ -80,14 +81,17 @@ def export_vtkhdf(source: Path, output: Path | None, options: ExportOptions, pro
         )
     quantities: tuple[str, ...] = ()
     grids: list[Grid] = []
+    points = 0.0
     if options.grid is not None:
         quantities = quantities_named(options.quantities, problem, options.disturbance)
         box = box_of(trajectory, frames, options.box)
         shape = grid_shape(options.grid, box)
-        check_memory(problem, float(shape[0]) * shape[1], len(frames), quantities, True, not options.shapes)
+        points = float(shape[0]) * shape[1]
+    check_memory(problem, points, len(frames), quantities, True, not options.shapes, corners(problem.X, options.refine))
+    if options.grid is not None:
         grids = [Grid.of(box, shape)] * len(frames)
     request = Request(frames, quantities, grids, None, not options.shapes, options.disturbance, options.tolerance)
-    output.absolute().parent.mkdir(parents=True, exist_ok=True)
+    make_folder(output.parent)
     found = list(sampled(trajectory, problem, request, parts_of(output), progress))
 
     files = [output]
@@ -103,16 +107,16 @@ def export_vtkhdf(source: Path, output: Path | None, options: ExportOptions, pro
         write_tracers(files[-1], trajectory, frames)
     if "walls" in trajectory.attributes:
         files.append(output.with_suffix(".walls.vtkhdf"))
-        corners, cells = _polylines([resample(X, 2 * X.shape[-1]).T for X in trajectory.attributes["walls"]])
-        write_polydata(files[-1], t[:1], corners[None], cells, "Lines", {}, {"wall": np.arange(len(cells))})
+        outlines, cells = _polylines([resample(X, 2 * X.shape[-1]).T for X in trajectory.attributes["walls"]])
+        write_polydata(files[-1], t[:1], outlines[None], cells, "Lines", {}, {"wall": np.arange(len(cells))})
     remove_parts(output)
     return Exported(files, notices)
 
 
 def write_membranes(path: Path, trajectory: Trajectory, found: Sequence[FrameFields], refine: int | None = None) -> None:
     """Membranes of the frames; with tension, traction and velocity where the frames have them. refine: corners a node."""
-    _, M, _, N = trajectory.X.shape
-    n = N * (refine or -(-LEAST_CORNERS // N))
+    M = trajectory.X.shape[1]
+    n = corners(trajectory.X[0], refine) // M
     points: list[np.ndarray] = []
     data: dict[str, list[np.ndarray]] = {}
     for frame in found:
@@ -132,6 +136,12 @@ def write_membranes(path: Path, trajectory: Trajectory, found: Sequence[FrameFie
     on_points = {name: np.stack(value) for name, value in data.items()} | {"vesicle": np.tile(vesicle, (len(found), 1))}
     _, cells = _polylines([np.zeros((n, 2))] * M)
     write_polydata(path, np.array([f.t for f in found]), np.stack(points), cells, "Lines", on_points, {"vesicle": np.arange(M)})
+
+
+def corners(X: np.ndarray, refine: int | None) -> int:
+    """Of all membranes X (M, 2, N) of a frame."""
+    M, _, N = X.shape
+    return M * N * (refine or -(-LEAST_CORNERS // N))
 
 
 def write_tracers(path: Path, trajectory: Trajectory, frames: Sequence[int]) -> None:

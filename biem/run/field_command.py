@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from biem.observe.grid import Grid, box_around, frames_named, grid_shape, read_box
-from biem.run.field_files import read_points, write_fields, write_table
+from biem.run.field_files import write_fields, write_table
 from biem.run.fields import Request, check_memory, parts_of, quantities_named, remove_parts, sampled
+from biem.run.files import make_folder
 from biem.run.observe import problem_of
 from biem.run.trajectory import Trajectory, read_trajectory
 from biem.scene.build import Problem
+from biem.scene.tracers import points_from_file
 
 PICTURES, MOVIES = (".png",), (".gif", ".mp4")
 ENDINGS = (".h5", ".csv", *PICTURES, *MOVIES)
@@ -53,7 +55,7 @@ def make_fields(source: Path, output: Path, options: Options, progress: Callable
         raise ValueError(f"--frames {options.frames} names {len(frames)} frames, {kind} holds one: name one, or write a .gif or a .mp4")
     drawn = kind in (*PICTURES, *MOVIES)
     quantities = _quantities(options, problem, drawn)
-    points = None if options.points is None else read_points(options.points)
+    points = None if options.points is None else points_from_file(options.points, "--points")
     if points is None:
         box = box_of(trajectory, frames, options.box, options.follow)
         shape = grid_shape(options.grid, box)
@@ -63,7 +65,7 @@ def make_fields(source: Path, output: Path, options: Options, progress: Callable
         check_memory(problem, len(points), len(frames), quantities, True)
         grids = []
     request = Request(frames, quantities, grids, points, disturbance=options.disturbance, tolerance=options.tolerance)
-    output.absolute().parent.mkdir(parents=True, exist_ok=True)
+    make_folder(output.parent)
     again = lambda bar=iter: sampled(trajectory, problem, request, parts_of(output), bar)
     if drawn:
         from biem.run.field_pictures import Painter  # matplotlib loads slowly: only where it is needed

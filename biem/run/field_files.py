@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from biem.run.fields import FrameFields, Request
-from biem.run.files import atomic_h5, one_line, write_atomically
+from biem.run.files import atomic_h5, write_atomically
 
 ABOUT = (
     "inside: the vesicle that a point is in, -1 in the fluid between, -2 beyond a wall; stress = -pressure I + 2 mu E; limits from outside"
@@ -53,16 +53,3 @@ def write_table(path: Path, request: Request, frames: Sequence[FrameFields]) -> 
     form = ["%.17g", "%.17g", "%.17g", "%d", *("%.17g",) * (len(names) - 4)]
     np.savetxt(text, np.concatenate(rows), fmt=form, delimiter=",")
     write_atomically(path, text.getvalue().encode())
-
-
-def read_points(path: Path) -> np.ndarray:
-    """Points (P, 2) of a text file of rows of x and y. Raises ValueError."""
-    try:
-        x = np.loadtxt(path, ndmin=2, delimiter="," if "," in path.read_text(encoding="utf-8") else None)
-    except FileNotFoundError:
-        raise ValueError(f"--points {path} does not exist") from None
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise ValueError(f"--points {path}: {one_line(error)}; expected rows of two numbers, x and y") from None
-    if x.ndim != 2 or x.shape[1] != 2 or not len(x) or not np.isfinite(x).all():
-        raise ValueError(f"--points {path}: {len(x)} rows of {x.shape[-1]} columns; expected rows of two finite numbers, x and y")
-    return x

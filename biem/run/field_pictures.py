@@ -38,12 +38,12 @@ class Shown:
 
 
 SHOWN = {
-    "speed": Shown("velocity", lambda u: np.hypot(u[:, 0], u[:, 1]), "speed", False),
-    "u": Shown("velocity", lambda u: u[:, 0], "velocity along x"),
-    "v": Shown("velocity", lambda u: u[:, 1], "velocity along y"),
-    "pressure": Shown("pressure", lambda p: p, "pressure"),
-    "vorticity": Shown("vorticity", lambda omega: omega, "vorticity"),
-    "shear_stress": Shown("stress", lambda s: s[:, 0, 1], "shear stress"),
+    "speed": Shown("velocity", lambda u: np.hypot(u[:, 0], u[:, 1]), "speed [length/time]", False),
+    "u": Shown("velocity", lambda u: u[:, 0], "velocity along x [length/time]"),
+    "v": Shown("velocity", lambda u: u[:, 1], "velocity along y [length/time]"),
+    "pressure": Shown("pressure", lambda p: p, "pressure [kappa_b/length^3]"),
+    "vorticity": Shown("vorticity", lambda omega: omega, "vorticity [1/time]"),
+    "shear_stress": Shown("stress", lambda s: s[:, 0, 1], "shear stress [kappa_b/length^3]"),
 }
 
 
@@ -130,9 +130,12 @@ class Painter:
         axes.add_collection(LineCollection(_closed(_shown(self.trajectory, frame.frame)), colors=ink, linewidths=1.0, zorder=4))
         if self.trajectory.tracers is not None:
             x, lattice = self.trajectory.tracers[frame.frame], self.trajectory.lattice(frame.frame)
-            axes.plot(*(x if lattice is None else lattice.wrapped(x)).T, ".", color="tab:orange", markersize=3, zorder=5)
+            x = x if lattice is None else lattice.wrapped(x)
+            axes.plot(*x.T, "o", color="tab:orange", markeredgecolor="black", markeredgewidth=0.3, markersize=2.5, zorder=5)
         axes.set_xlim(*extent[:2])
         axes.set_ylim(*extent[2:])
+        axes.set_xlabel("x [length]")
+        axes.set_ylabel("y [length]")
         time, unit = _times(self.trajectory)
         axes.set_title(f"{unit} = {time[frame.frame]:.4g}", fontsize=10)
 

@@ -27,6 +27,8 @@ from biem.run.trajectory import Trajectory
 from biem.scene.build import Problem
 from biem.scene.plan import memory_estimate
 
+VALUES_A_CORNER = 12  # of a polyline: where it is and what it holds, with the third components
+
 
 @dataclass(frozen=True)
 class Request:
@@ -78,15 +80,25 @@ def quantities_named(text: str | None, problem: Problem, disturbance: bool) -> t
     return names
 
 
-def check_memory(problem: Problem, points: float, frames: int, quantities: Sequence[str], kept: bool, membranes: bool = False) -> None:
+def check_memory(
+    problem: Problem, points: float, frames: int, quantities: Sequence[str], kept: bool, membranes: bool = False, corners: int = 0
+) -> None:
     """Raises ValueError, before anything is computed, where this machine has not the memory.
 
-    points: of a frame; kept: whether all frames are held until they are written; membranes: as of `Request`.
+    points: of a frame; kept: whether all frames are held until they are written; membranes: as of `Request`; corners: of the
+    polylines of a frame.
     """
     values = (1 + sum(SIZES[name] for name in quantities)) * points + (5 * problem.X.size if membranes else 0)
     needed = field_bytes(problem, points, quantities) + memory_estimate(problem) + (3.0 * 8.0 * values * frames if kept else 0.0)
+    polylines = 3.0 * 8.0 * VALUES_A_CORNER * corners * frames
+    needed += polylines
     free = free_memory()
     if needed > free:
+        if polylines > 0.5 * needed:
+            raise ValueError(
+                f"membranes of {corners} corners at {frames} frames need about {needed / 1e6:.3g} MB of memory, {free / 1e6:.3g} MB are "
+                "free: take fewer frames, or a smaller --refine"
+            )
         many = f"{frames} frames of " if kept and frames > 1 else ""
         raise ValueError(
             f"fields at {many}{points:.4g} points need about {needed / 1e6:.3g} MB of memory, {free / 1e6:.3g} MB are free: take a coarser "

@@ -20,6 +20,14 @@ def atomic_h5(path: Path) -> Iterator[h5py.File]:
     write_atomically(path, image.getbuffer())
 
 
+def make_folder(path: Path) -> None:
+    """The folder, and those that it lies in, where they are not there yet. Raises OSError with the path in it."""
+    try:
+        path.absolute().mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"folder {path} cannot be made ({error.strerror or one_line(error)}): choose another place") from None
+
+
 def write_atomically(path: Path, content: bytes | memoryview) -> None:
     """A file of this content: the old one, if there is one, until the new one is whole. Raises OSError (disk full, no permission)."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")

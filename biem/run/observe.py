@@ -13,7 +13,8 @@ import numpy as np
 
 from biem.backend import fft_backend, stage, to_numpy
 from biem.observe.observables import BINS, Observations, Observer, join
-from biem.observe.quantities import known
+from biem.observe.quantities import QUANTITIES, known
+from biem.run.files import make_folder
 from biem.run.observations import (
     ObservationWriter,
     are_observations,
@@ -144,11 +145,14 @@ def observe_file(
                 f"the run has not come to its horizon: its {len(trajectory)} frames to t = {trajectory.t[-1]:.6g} of {problem.horizon:.6g} "
                 "are observed"
             )
+        known(names if names is not None else QUANTITIES)
+        for place in (output.parent, plots or output.parent):
+            make_folder(place)  # before anything is computed
         partial = output.with_name(output.name + ".partial.h5")
         rows = observe(
             trajectory, problem, names, stored_tension=stored_tension, every=every, bins=bins, partial=partial, progress=progress
         )
-    output.absolute().parent.mkdir(parents=True, exist_ok=True)
+    make_folder(output.parent)
     files = write_observations(output, rows)
     if not written:
         remove(partial)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from biem.observe.observables import Observations
 from biem.observe.quantities import QUANTITIES
+from biem.run.files import make_folder
 from biem.run.observations import columns
 
 LINE, FILL = "#7a3b00", "#e8a33d"
@@ -39,7 +40,7 @@ def draw_observables(rows: Observations, folder: Path) -> list[Path]:
         groups["rheology"] = ["stress", "normal_stress_difference"]
     if "pair_distance" in has and len(rows.pairs) == 1:
         groups["distances"].remove("nearest_distance")  # the same
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     files = []
     if len(rows) > 1:
         for name, names in groups.items():

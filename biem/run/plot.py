@@ -18,6 +18,7 @@ from matplotlib.patches import Rectangle
 from biem.backend import to_numpy
 from biem.curves.curve import centroid, effective_radius
 from biem.curves.fourier import resample
+from biem.run.files import make_folder
 from biem.run.trajectory import MONITORED, Trajectory
 
 FACE, EDGE, WALL = "#e8a33d", "#7a3b00", "#4a5560"
@@ -31,7 +32,7 @@ def draw_all(trajectory: Trajectory, folder: Path, movie: bool = True, progress:
     """All pictures that this trajectory has, as files in `folder`; returns their paths. Raises ValueError for an empty one."""
     if len(trajectory) == 0:
         raise ValueError("the trajectory has no frames: there is nothing to draw")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     time, unit = _times(trajectory)
     files = [_snapshots(trajectory, time, unit, folder / "frames.png"), _history(trajectory, time, unit, folder / "energy.png")]
     scene = json.loads(trajectory.attributes["scene"])

@@ -82,7 +82,7 @@ def run_lines(report: Mapping[str, Any]) -> list[str]:
         lines.append(f"outside the training distribution: at most {outside} of {report['vesicles']} vesicles in a step")
         lines[-1] += f"; by exact maps: at most {exact}" if exact else ""
     size = report["processes"]
-    used = ", ".join(f"{name} {n}" for name, n in report["used"].items())
+    used = ", ".join(f"{name} {n}" for name, n in report["used"].items() if n)
     return [*lines, ("used: " if size == 1 else f"used by the first of {size} processes: ") + used]
 
 

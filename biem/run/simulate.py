@@ -28,7 +28,7 @@ from biem.run.checkpoint import Checkpoint
 from biem.run.guard import check_state
 from biem.run.observe import observer_of_run
 from biem.run.output import Output, where_to_resume
-from biem.run.solver import make_stepper, on_device
+from biem.run.solver import check_machine, make_stepper, on_device
 from biem.run.trajectory import MONITORED, SCHEMA, Trajectory, one_frame
 from biem.scene.build import Problem, build
 from biem.scene.config import Scene
@@ -86,6 +86,7 @@ def _simulate(scene: Scene, path: Path | None, resume: bool, force: bool, progre
     found = ranks.on_root(lambda: where_to_resume(path, resolved, resume, force))
     problem = ranks.together(lambda: build(scene))
     if found is None:
+        ranks.together(lambda: check_machine(problem, ranks))
         tracers = ranks.together(lambda: place_tracers(problem))
         start = Checkpoint(0, State(0.0, problem.X), area(problem.X), length(problem.X), resolved, run=uuid4().hex)
         start = start if tracers is None else replace(start, tracers=tracers.x)

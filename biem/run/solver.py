@@ -54,9 +54,10 @@ def check_machine(problem: Problem, ranks: Ranks = ALONE) -> None:
         way = 'solver.kind = "split"' if problem.scene.solver.kind == "implicit" else 'solver.dtype = "float32"'
         if problem.walls is not None:
             way = f"a larger walls.spacing (the walls have {len(problem.walls.nodes)} nodes), or {way}"
+        tracers = "" if problem.scene.tracers is None else " and tracers"
         raise ValueError(
-            f"a step of {M} vesicles of {N} nodes needs about {needed / 1e6:.3g} MB of memory, {free / 1e6:.3g} MB are free: take fewer "
-            f"vesicles or nodes, or {way}"
+            f"a step of {M} vesicles of {N} nodes{tracers} needs about {needed / 1e6:.3g} MB of memory, {free / 1e6:.3g} MB are free: take "
+            f"fewer vesicles{tracers.replace(' and', ',')} or nodes, or {way}"
         )
 
 

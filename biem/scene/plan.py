@@ -21,6 +21,7 @@ from biem.stokes.single_layer import near_scheme
 
 DENSE = ("exact", "hybrid")  # maps that factorise a dense matrix
 MATRICES = {"self_tension": 0.0, "advection": 1.0, "flow_tension": 0.5, "near": len(LAYERS)}  # values over those of a (2N, 2N) matrix
+VALUES_A_TRACER = 40  # float64 values in work while tracers are carried
 
 
 @dataclass(frozen=True)
@@ -201,10 +202,10 @@ def memory_estimate(problem: Problem) -> float:
     size = 4.0 if solver.dtype == "float32" else 8.0
     near_pairs = M * N  # one close neighbour for every node
     extent = np.ptp(problem.X, axis=(0, 2))
-    far = 0.0
+    far = 8.0 * VALUES_A_TRACER * _tracer_count(problem)
     if problem.interacting:
         of = M * N, M, N, _scheme(problem), solver.tolerances[1], (float(extent[0]), float(extent[1]))
-        far = far_field_bytes(*of, lattice=_lattice(problem))
+        far += far_field_bytes(*of, lattice=_lattice(problem))
     if problem.walls is not None:
         P = len(problem.walls.nodes)
         far += 8.0 * 2 * (2 * P) ** 2 + 16.0 * sum(X.shape[1] ** 2 for X in problem.walls.curves)  # the equations while they are made
@@ -217,7 +218,7 @@ def memory_estimate(problem: Problem) -> float:
         return maps + 12 * 8.0 * chunk + 8.0 * (24 * M * 2 * n + 40 * M * 2 * N + 16 * near_pairs) + far
     one_chunk = 16 * (2 * n) ** 2  # operators of the vesicles in work
     if not problem.interacting and problem.walls is None:
-        return 8.0 * one_chunk
+        return 8.0 * one_chunk + far
     response = M * (2 * N) * (5 * N)
     krylov = 2 * M * N * 40
     return 8.0 * (2 * one_chunk + 2 * response + krylov + near_pairs * 4 * N) + far

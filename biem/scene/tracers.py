@@ -28,15 +28,24 @@ def check_tracers(scene: Scene) -> None:
 
 
 def tracers_from_file(path: Path) -> np.ndarray:
-    """Points (P, 2) of a text file of rows of x and y. Raises ValueError."""
+    """Points (P, 2) of `tracers.file`. Raises ValueError."""
+    return points_from_file(path, "tracers.file", " (paths are relative to the scene)")
+
+
+def points_from_file(path: Path, name: str, where: str = "") -> np.ndarray:
+    """Points (P, 2) of a text file of rows of x and y, apart by spaces or commas. name: of what asks for it. Raises ValueError."""
+    expected = "expected rows of two finite numbers, x and y"
     try:
-        x = np.loadtxt(path, ndmin=2)
+        text = path.read_text(encoding="utf-8")
+        rows = [line for line in text.splitlines() if line.partition("#")[0].strip()]
+        x = np.loadtxt(rows, ndmin=2, delimiter="," if "," in text else None) if rows else np.zeros((0, 2))
     except FileNotFoundError:
-        raise ValueError(f"tracers.file {path} does not exist (paths are relative to the scene)") from None
+        raise ValueError(f"{name} {path} does not exist{where}") from None
     except OSError as error:
-        raise ValueError(f"tracers.file {path} cannot be read: {error}") from None
+        raise ValueError(f"{name} {path} cannot be read: {error}") from None
     except ValueError as error:
-        raise ValueError(f"tracers.file {path}: {' '.join(str(error).split())}; expected two columns, x and y, apart by spaces") from None
+        said = " ".join(str(error).partition(";")[0].rstrip(".").split())
+        raise ValueError(f"{name} {path}: {said}; {expected}") from None
     if x.shape[1] != 2 or not len(x) or not np.isfinite(x).all():
-        raise ValueError(f"tracers.file {path}: {len(x)} rows of {x.shape[1]} columns; expected rows of two finite numbers, x and y")
+        raise ValueError(f"{name} {path}: {len(x)} rows of {x.shape[1]} columns; {expected}")
     return x

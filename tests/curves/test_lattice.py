@@ -87,6 +87,17 @@ def test_no_image_that_is_near_is_missing(lattice, convert, reach):
     assert len(source) < 6 * (13 if reach < 0.7 else 60)
 
 
+def test_images_of_rows_that_have_slid_far_are_found():
+    """Of a flat box, many rows up: as many as by bounding boxes among all images."""
+    lattice, reach = Lattice(4.0, 0.5, 1.9), 3.0
+    X = lattice.wrapped_curves(some_curves()[:1])
+    low, high = X.min(axis=-1)[0], X.max(axis=-1)[0]
+    d = np.array([[4.0 * m + 1.9 * n, 0.5 * n] for m in range(-20, 21) for n in range(-20, 21) if m or n])
+    near = ((low + d <= high + reach) & (high + d >= low - reach)).all(axis=1).sum()
+    assert near > 15
+    assert len(lattice.with_images(X, reach)[0]) == 1 + near
+
+
 def test_curves_torn_apart_have_no_images():
     X = some_curves()
     X[2, 0, 5], X[4, 1, 0] = 1e12, np.nan

@@ -16,7 +16,7 @@ pytest.importorskip("mpi4py")
 pytestmark = [pytest.mark.usefixtures("fakes"), pytest.mark.skipif(not MPIRUN.exists(), reason="no mpirun beside the interpreter")]
 
 
-@pytest.mark.parametrize("ranks", [1, 2, 3, 5])
+@pytest.mark.parametrize("ranks", [1, 3])
 def test_any_number_of_ranks_leaves_the_same_bytes_and_speaks_once(tmp_path, config, whole, ranks):
     exit_code, printed, bars = ranks_run(ranks, "make", config, "-o", tmp_path / "data", FAKE_LOG=str(tmp_path / "log"), FAKE_BUSY="0.01")
     assert exit_code == 0, bars

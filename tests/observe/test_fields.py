@@ -245,3 +245,14 @@ def test_memory_grows_with_points_and_quantities(fields):
     assert many - few == pytest.approx(8 * 2 * 5 * (1e8 - 1e6), rel=1e-6)
     assert field_bytes(problem, 1e8, QUANTITIES) > 1.5 * many
     assert few > 8 * CHUNK_VALUES * 2**18
+
+
+def test_fields_of_a_sheared_box_are_those_of_its_time():
+    """On the membranes they have the instant's velocity, whose images are where they are then; one row up the flow is faster."""
+    pair = {"vesicles": {"centers": [[0.0, 0.3], [0.1, -0.3]], "angles": [0.0, 0.0], "points": 32}, "domain": {"periodic": [1.0, 0.9]}}
+    problem = build(scene_of(pair))
+    at = instant(problem, problem.X, 0.004)
+    field, nodes_of = FlowField(problem, at, 1e-8), problem.X[0].T
+    assert np.abs(field.values(nodes_of).velocity - at.velocity[0].T).max() < 1e-5 * np.abs(at.velocity).max()
+    above = field.values(nodes_of + problem.box.at(0.004).vectors[1]).velocity - field.values(nodes_of).velocity
+    assert np.abs(above - [90.0, 0.0]).max() < 1e-6

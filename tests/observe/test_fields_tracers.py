@@ -204,8 +204,10 @@ BAD = {
     "neither": ({}, "give count (and box), or file, one of them"),
     "both": ({"count": 3, "file": "points.txt"}, "one of them"),
     "no file": ({"file": "none.txt"}, "none.txt does not exist"),
-    "no numbers": ({"file": "words.txt"}, "expected two columns"),
+    "no numbers": ({"file": "words.txt"}, "expected rows of two finite numbers"),
     "three columns": ({"file": "three.txt"}, "1 rows of 3 columns"),
+    "nothing in it": ({"file": "empty.txt"}, "0 rows of 2 columns"),
+    "beyond memory": ({"count": 10**12}, "and tracers needs about"),
     "file and box": ({"file": "points.txt", "box": [1.0, 1.0]}, "tracers.box goes with count"),
     "no box": ({"count": 3, "corner": [0.0, 0.0]}, "tracers.corner goes with a box"),
     "flat box": ({"count": 3, "box": [1.0, 0.0]}, "both sides must be positive"),
@@ -220,6 +222,7 @@ def test_a_table_that_lacks_something_ends_in_one_line(tmp_path, case, monkeypat
     np.savetxt(tmp_path / "points.txt", [[0.0, 0.0]])
     np.savetxt(tmp_path / "three.txt", [[0.0, 0.0, 1.0]])
     (tmp_path / "words.txt").write_text("here and there\n")
+    (tmp_path / "empty.txt").write_text("# x y\n\n")
     changes, fragment = BAD[case]
     path = write_scene(tmp_path, **({"tracers": changes} if changes else {}))
     if not changes:
@@ -232,3 +235,14 @@ def test_a_point_beyond_the_walls_is_refused(tmp_path):
     np.savetxt(tmp_path / "points.txt", [[0.0, 0.0], [0.0, 0.7]])
     with pytest.raises(ValueError, match="point 1 is not in the fluid"):
         place_tracers(build(scene_of(CHANNEL, tracers={"file": "points.txt"}, folder=tmp_path)))
+    plan = cli("plan", write_scene(tmp_path, CHANNEL, tracers={"file": "points.txt"}), "--no-measure")
+    assert "point 1 is not in the fluid" in the_error(plan, 2)
+
+
+def test_a_place_is_drawn_from_one_sequence_however_many_at_once(monkeypatch):
+    problem = build(scene_of(PAIR, tracers={"count": 40, "region": "inside"}))
+    whole = place_tracers(problem)
+    assert (whole.vesicle >= 0).all()
+    assert np.array_equal(place_tracers(problem, most=3).x, whole.x[:3])
+    monkeypatch.setattr("biem.observe.tracers.DRAWN_AT_ONCE", 1)
+    assert np.array_equal(place_tracers(problem).x, whole.x)

@@ -100,11 +100,11 @@ def test_distances():
     assert of(X, "smallest_gap", three) == pytest.approx(0.3, rel=1e-6)
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.7, -1.1])
-def test_nearest_images(offset):
-    lattice = Lattice(2.4, 1.1, offset)
+@pytest.mark.parametrize("lattice", [(2.4, 1.1), (2.4, 1.1, 0.7), (2.4, 1.1, -1.1), (5.0, 0.7, 1.25), (6.0, 0.6, -2.4), (0.7, 5.0, 0.3)])
+def test_nearest_images(lattice):
+    lattice = Lattice(*lattice)
     c = np.random.default_rng(0).uniform(-4.0, 4.0, (6, 2))
-    shifts = np.array([m * lattice.vectors[0] + n * lattice.vectors[1] for m in range(-12, 13) for n in range(-12, 13)])
+    shifts = np.array([m * lattice.vectors[0] + n * lattice.vectors[1] for m in range(-15, 16) for n in range(-15, 16)])
     i, j = motion.pairs(6).T
     every = np.hypot(*np.moveaxis((c[i] - c[j])[:, None] + shifts, -1, 0))
     assert motion.pair_distances(c, lattice) == pytest.approx(every.min(axis=1), rel=1e-12)
@@ -112,6 +112,17 @@ def test_nearest_images(offset):
     to_others[i, j] = to_others[j, i] = every.min(axis=1)
     own = np.hypot(*shifts[np.abs(shifts).sum(1) > 0].T).min()
     assert motion.nearest_distances(c, lattice) == pytest.approx(np.minimum(to_others.min(axis=1), own), rel=1e-12)
+
+
+def test_distances_in_a_sheared_box_are_those_of_its_time():
+    pair = {"vesicles": {"centers": [[0.0, 0.6], [0.1, -0.55]], "angles": [0.0, 0.0]}, "domain": {"periodic": [2.0, 1.6]}}
+    problem = build(scene_of(pair))
+    observer = Observer.of(problem, ["pair_distance", "nearest_distance"])
+    for t in (0.0, 0.003, 0.011):  # the row above has moved on by 160 t, by multiples of 2 less
+        across = np.hypot((0.1 + 160.0 * t + 1.0) % 2.0 - 1.0, 0.45)
+        values = observer.row(problem.X, t, 0).values
+        assert values["pair_distance"][0] == pytest.approx([min(across, np.hypot(0.1, 1.15))], rel=1e-9)
+        assert values["nearest_distance"][0] == pytest.approx([min(across, np.hypot(0.1, 1.15))] * 2, rel=1e-9)
 
 
 def test_across_a_channel():

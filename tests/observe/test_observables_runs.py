@@ -259,6 +259,15 @@ REFUSED = (
 )
 
 
+def test_places_that_cannot_be_written_to_are_told_before_anything_is_computed(tmp_path, done):
+    (tmp_path / "file").write_text("not a folder")
+    for options in (["--plots", tmp_path / "file"], ["-o", tmp_path / "file" / "o.csv"]):
+        with counting() as counts:
+            assert "file cannot be made (" in the_error(cli("observe", done[0], *options), 5)
+        assert counts["observed"] == 0
+    assert (tmp_path / "file").read_text() == "not a folder"
+
+
 @pytest.mark.parametrize(("options", "message"), REFUSED)
 def test_bad_input_is_one_line(done, options, message):
     assert message in the_error(cli("observe", done[0], *options), 2)

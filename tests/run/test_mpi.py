@@ -1,5 +1,6 @@
 """Runs under mpirun: the trajectory of one process, one voice, restarts with another number of processes, errors that end all of them."""
 
+import json
 import os
 import re
 import signal
@@ -70,10 +71,10 @@ def stops_the_first(x, y, t):
 """
 
 
-def mpi(processes, *arguments, **environment):
+def mpi(processes, *arguments, program=("-m", "biem"), **environment):
     """`python -m biem` on so many processes; its exit code, stdout and stderr. Fails where it does not end."""
     # one thread each; processes that outnumber the cores spin while they wait, which only costs time
-    command = [MPIRUN, "-n", processes, sys.executable, "-m", "biem", *arguments]
+    command = [MPIRUN, "-n", processes, sys.executable, *program, *arguments]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
     try:
         done = subprocess.run([str(c) for c in command], env=environment, capture_output=True, text=True, check=False, timeout=LIMIT)
@@ -81,6 +82,19 @@ def mpi(processes, *arguments, **environment):
         printed = (late.stderr or b"").decode()
         pytest.fail(f"does not end within {LIMIT} s: {' '.join(map(str, arguments))}; printed {printed!r}")
     return done.returncode, done.stdout, done.stderr
+
+
+def together(folder, processes, commands):
+    """What `mpi` gives of each command, all under one mpirun, one after the other; all processes end each with the same code."""
+    (folder / "commands.json").write_text(json.dumps([[str(c) for c in command] for command in commands]))
+    program = (Path(__file__).parents[1] / "mpi_program.py",)
+    assert mpi(processes, folder, program=program) == (0, "", "")
+    found = []
+    for k in range(len(commands)):
+        codes = {int((folder / f"{k}.{rank}.code").read_text()) for rank in range(processes)}
+        assert len(codes) == 1, (commands[k], codes)
+        found.append((codes.pop(), *((folder / f"{k}.{name}").read_text() for name in ("out", "err"))))
+    return found
 
 
 def the_mpi_error(done, *codes):
@@ -105,12 +119,25 @@ def assert_close_frames(a, b, scale=1.0):
     assert np.abs(a.sigma - b.sigma).max() < 1e-10 * np.abs(b.sigma).max()
 
 
-@pytest.mark.parametrize(
-    ("processes", "way"), [(1, "order 1"), (2, "order 1"), (2, "order 2"), (2, "adaptive"), (3, "adaptive"), (2, "walls")]
-)
-def test_any_number_of_processes_gives_the_trajectory_of_one_and_speaks_once(tmp_path, processes, way):
-    path, out = write_scene(tmp_path, TEN, WAYS[way]), tmp_path / "out.h5"
-    exit_code, printed, bars = mpi(processes, "run", path, "-o", out)
+@pytest.fixture(scope="module")
+def of_three(tmp_path_factory):
+    """A folder of runs on three processes: of each way, and of what three processes are too many for. What became of them, by name."""
+    folder = tmp_path_factory.mktemp("three")
+    paths = {}
+    for name, changes in {**WAYS, "too few": {"vesicles": {"count": 2}}}.items():
+        (folder / name).mkdir()
+        paths[name] = write_scene(folder / name, TEN, changes)
+    runs = together(folder, 3, [["run", path, "-o", folder / name / "out.h5"] for name, path in paths.items()])
+    return {name: (path, folder / name / "out.h5", done) for (name, path), done in zip(paths.items(), runs, strict=True)}
+
+
+@pytest.mark.parametrize(("processes", "way"), [(1, "order 1"), (2, "order 2"), *((3, way) for way in WAYS)])
+def test_any_number_of_processes_gives_the_trajectory_of_one_and_speaks_once(tmp_path, of_three, processes, way):
+    if processes == 3:
+        path, out, (exit_code, printed, bars) = of_three[way]
+    else:
+        path, out = write_scene(tmp_path, TEN, WAYS[way]), tmp_path / "out.h5"
+        exit_code, printed, bars = mpi(processes, "run", path, "-o", out)
     assert exit_code == 0, bars
     done, whole = read_trajectory(out), whole_run(tmp_path, path)
     assert len(whole) > 2
@@ -124,11 +151,11 @@ def test_any_number_of_processes_gives_the_trajectory_of_one_and_speaks_once(tmp
     assert sum(f"{STEPS}/{STEPS}" in line for line in last) <= 2  # the last step and the end
     assert all(line.startswith("tiny:") for line in last), bars
     assert not re.search(r"error|warning", bars, re.IGNORECASE), bars
-    assert not (tmp_path / "out.h5.frames").exists()
+    assert not out.with_name("out.h5.frames").exists()
 
 
-@pytest.mark.parametrize(("before", "after"), [(2, 1), (1, 2)])
-def test_checkpoint_of_some_processes_is_resumed_by_others(tmp_path, before, after):
+def test_checkpoint_of_some_processes_is_resumed_by_others(tmp_path):
+    """One process, then two, then one."""
     path, out = write_scene(tmp_path, TEN, {"time": {"order": 2}}), tmp_path / "out.h5"
     whole = whole_run(tmp_path, path)
 
@@ -139,9 +166,12 @@ def test_checkpoint_of_some_processes_is_resumed_by_others(tmp_path, before, aft
             exit_code, printed, errors = mpi(processes, "run", path, "-o", out, "--quiet", *arguments)
             assert (exit_code, printed, errors) == (0, "", "")
 
-    run(before, "--set", f"time.horizon={2 * DT}")
-    assert read_checkpoint(checkpoint_path(out)).state.coupling is not None
-    run(after, "--resume")
+    for steps, processes in ((1, 1), (3, 2)):
+        run(processes, "--set", f"time.horizon={steps * DT}", *(["--resume"] if steps > 1 else []))
+        checkpoint = read_checkpoint(checkpoint_path(out))
+        assert checkpoint.step == steps
+        assert checkpoint.state.coupling is not None
+    run(1, "--resume")
     assert_close_frames(read_trajectory(out), whole)
 
 
@@ -183,29 +213,51 @@ def test_a_signal_to_mpirun_stops_all_and_the_run_goes_on(tmp_path):
 
 
 REFUSED = {
-    "more processes than vesicles": (3, {"vesicles": {"count": 2}}, [], r"3 processes for 2 vesicle\(s\)"),
-    "implicit": (2, {}, ["--solver", "implicit"], r'"implicit" runs in one process: leave out mpirun, or take solver.kind = "split"'),
-    "unknown key": (2, {}, ["--set", "solver.knd=1"], "unknown key solver.knd"),
-    "nothing to resume": (2, {}, ["--resume"], "no readable checkpoint"),
+    "implicit": (["--solver", "implicit"], r'"implicit" runs in one process: leave out mpirun, or take solver.kind = "split"'),
+    "unknown key": (["--set", "solver.knd=1"], "unknown key solver.knd"),
+    "nothing to resume": (["--resume"], "no readable checkpoint"),
 }
+UNWRITABLE = ("a file as folder", "a folder as file")
+
+
+@pytest.fixture(scope="module")
+def of_two(tmp_path_factory):
+    """A folder of a scene and one named folder, what cannot be run in there on two processes, by name, and the files that it leaves."""
+    folder, told = tmp_path_factory.mktemp("two"), tmp_path_factory.mktemp("told")
+    path = write_scene(folder, SMALL)
+    (folder / "folder").mkdir()
+    outputs = [*(folder / "out.h5" for _ in REFUSED), path / "out.h5", folder / "folder"]
+    arguments = [*(arguments for arguments, _ in REFUSED.values()), [], []]
+    runs = together(told, 2, [["run", path, "-o", out, "--quiet", *more] for out, more in zip(outputs, arguments, strict=True)])
+    return folder, dict(zip((*REFUSED, *UNWRITABLE), runs, strict=True))
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_run_is_told_once_by_all_processes(tmp_path, case):
-    processes, changes, arguments, expected = REFUSED[case]
-    path = write_scene(tmp_path, SMALL, changes)
-    message = the_mpi_error(mpi(processes, "run", path, "-o", tmp_path / "out.h5", "--quiet", *arguments), 2)
-    assert re.search(expected, message), message
-    assert not list(tmp_path.glob("out*"))
+def test_what_cannot_run_is_told_once_by_all_processes(of_two, case):
+    folder, told = of_two
+    message = the_mpi_error(told[case], 2)
+    assert re.search(REFUSED[case][1], message), message
+    assert sorted(path.name for path in folder.iterdir()) == ["folder", "scene.toml"]
+    assert not list((folder / "folder").iterdir())
 
 
-@pytest.mark.parametrize("where", ["a file as folder", "a folder as file"])
-def test_output_that_cannot_be_written_ends_all_in_one_line(tmp_path, where):
+def test_more_processes_than_vesicles_are_told_once(of_three):
+    path, _, done = of_three["too few"]
+    assert "3 processes for 2 vesicle(s)" in the_mpi_error(done, 2)
+    assert [file.name for file in path.parent.iterdir()] == ["scene.toml"]
+
+
+def test_a_refusal_is_the_exit_code_of_mpirun(tmp_path):
     path = write_scene(tmp_path, SMALL)
-    (tmp_path / "folder").mkdir()
-    out = path / "out.h5" if where == "a file as folder" else tmp_path / "folder"
-    message = the_mpi_error(mpi(2, "run", path, "-o", out, "--quiet"), 2, 5)
-    assert str(out if where == "a folder as file" else path) in message
+    message = the_mpi_error(mpi(2, "run", path, "-o", tmp_path / "out.h5", "--quiet", "--resume"), 2)
+    assert "no readable checkpoint" in message
+
+
+@pytest.mark.parametrize("where", UNWRITABLE)
+def test_output_that_cannot_be_written_ends_all_in_one_line(of_two, where):
+    folder, told = of_two
+    message = the_mpi_error(told[where], 2, 5)
+    assert str(folder / ("folder" if where == "a folder as file" else "scene.toml")) in message
 
 
 @pytest.mark.parametrize("function", ["refuses_at_once", "refuses", "is_not_a_number"])

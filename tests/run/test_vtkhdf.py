@@ -208,6 +208,7 @@ BAD = {
     "refine": (["--vtkhdf", "--refine", "0"], "--refine 0"),
     "frames": (["--vtkhdf", "--frames", "9"], "frames 0 to 3"),
     "memory": (["--vtkhdf", "--grid", "900000x900000"], "MB of memory"),
+    "memory of membranes": (["--vtkhdf", "--refine", "100000000"], "a smaller --refine"),
     "tolerance": (["--vtkhdf", "--grid", "9", "--tolerance", "0"], "--tolerance 0"),
 }
 

@@ -73,7 +73,7 @@ HOW = [{"box": [2.0, 2.0], "count": 9}, {"area_fraction": 0.3, "count": 9}, {"ar
 @pytest.mark.parametrize("shape", ["equilibrium", "perturbed"])
 @pytest.mark.parametrize("placement", ["random", "grid"])
 def test_vesicles_are_where_they_are_at_any_resolution(how, shape, placement):
-    X = [build(scene_of(vesicles={**how, "placement": placement, "shape": shape, "points": N})).X for N in (32, 48, 96)]
+    X = [build(scene_of(vesicles={**how, "placement": placement, "shape": shape, "points": N})).X for N in (32, 96)]
     for other in X[1:]:
         np.testing.assert_allclose(centroid(other), centroid(X[0]), atol=1e-4)  # 32 nodes hold the shape to that
 

@@ -7,7 +7,7 @@ from scene_helpers import PAIR, table
 from studies.compared import Ran, compare
 from studies.fitting import Entry
 from studies.rungs import Rung
-from studies.runs import Kept, Record
+from studies.runs import Kept, Record, read_record, run
 
 from biem.curves.shapes import equilibrium, place
 from biem.run.trajectory import TrajectoryWriter, join, one_frame
@@ -17,6 +17,17 @@ UNIT = 0.01  # t_gamma
 FRAMES = 31
 SPEED = (2.0, 0.5)  # R a t_gamma: the vesicles part
 TURN = 0.4  # rad a t_gamma
+
+
+def kept_here(scene, path, timeout=None):
+    """`studies.runs.kept` without a process of its own."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return Kept(scene, path, read_record(scene, path) or run(scene, path))
+
+
+def kept_all_here(tasks, *_, **__):
+    """`studies.runs.kept_all` in this process."""
+    return {name: kept_here(*task) for name, task in tasks.items()}
 
 
 def scene(**solver):

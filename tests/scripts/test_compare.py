@@ -7,12 +7,11 @@ import compare
 import numpy as np
 import pytest
 import typer
-from comparison_cases import UNIT, comparison, ran
+from comparison_cases import UNIT, comparison, kept_all_here, ran
 from scene_helpers import DT, PAIR, error_line, the_error, write_scene
 from studies import compared as numbers
 from studies.fitting import MOST_FRAMES, coarser, entry, reference_name
 from studies.pareto import front
-from studies.runs import Kept, run
 from typer.testing import CliRunner
 
 from biem.run.trajectory import read_trajectory
@@ -34,9 +33,9 @@ def at_once(monkeypatch):
     """Runs in this process, in place of one each."""
     begun = []
 
-    def all_here(tasks, workers, threads, desc):
+    def all_here(tasks, *_, **__):
         begun.extend(tasks)
-        return {name: Kept(scene, path, run(scene, path)) for name, (scene, path) in tasks.items()}
+        return kept_all_here(tasks)
 
     monkeypatch.setattr(compare, "kept_all", all_here)
     return begun
@@ -137,7 +136,7 @@ def test_summary_where_nothing_is_good(tmp_path):
     assert "Fastest" not in text
 
 
-def test_compares_with_runs_of_their_own(tmp_path):
+def test_compares_with_runs_of_their_own(tmp_path, monkeypatch):
     scene = write_scene(tmp_path, PAIR, vesicles={"points": 32}, time={"horizon": 4 * DT})
     solvers = "split[vesicles.points=16], vesnet:mlp"
     arguments = [scene, "--solvers", solvers, "--reference", TINY, "-o", tmp_path / "out"]
@@ -157,6 +156,7 @@ def test_compares_with_runs_of_their_own(tmp_path):
     assert f"vesnet:mlp was refused: {learned['failure']}" in done.output
     assert done.output.strip().endswith("report.html")
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
+    monkeypatch.setattr("studies.pictures.draw_all", lambda *_: None)  # drawn above
     again = command(*arguments)
     assert again.exit_code == 0
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*.h5")} == before

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trade
-from comparison_cases import moving
+from comparison_cases import kept_all_here, moving
 from scene_helpers import DT, PAIR, scene_of, write_scene
 from studies.pareto import front
 from studies.rungs import rung, split_list
@@ -110,6 +110,7 @@ def test_a_scene_from_before_a_key_is_the_same_scene():
 
 
 def test_from_sweeps_to_the_page(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(trade, "kept_all", kept_all_here)
     path = write_scene(tmp_path, PAIR)
     rungs = f"split[time.dt={DT}|{6 * DT}], split[solver.max_error=1e-9], balanced"
 
@@ -140,7 +141,7 @@ def test_from_sweeps_to_the_page(tmp_path, monkeypatch, capsys):
         ([], "error: no scene"),
         (["configs/scenes/relaxation.toml", "--solvers", "spilt"], 'error: solver "spilt"'),
         (["--page", "x.md", "-o", "nowhere"], "error: nowhere holds no trade.json"),
-        (["configs/scenes/relaxation.toml", "--reference", "none.h5"], "error: trajectory none.h5 does not exist"),
+        (["configs/scenes/relaxation.toml", "--solvers", "split", "--reference", "none.h5"], "error: trajectory none.h5 does not exist"),
     ],
 )
 def test_bad_input_is_one_line(monkeypatch, arguments, expected):

@@ -14,6 +14,7 @@ from biem.curves.fourier import resample
 from biem.curves.shapes import ellipse, equilibrium, place
 from biem.membrane.contrast import ContrastMaps, ContrastOperators
 from biem.membrane.maps import ExactMaps
+from biem.membrane.repulsion import Repulsion
 from biem.steppers.corrections import CORRECTIONS, Corrected
 from biem.steppers.implicit import ImplicitStepper
 from biem.steppers.order import Extrapolated
@@ -129,6 +130,15 @@ def test_orders_in_dt_and_one_limit(solver, contrast):
     limits = [smooth_run(solver, contrast, 2, 16) for solver in SOLVERS]
     assert np.abs(limits[0] - limits[1]).max() < 2e-5
     assert np.abs(limits[0] - smooth_run("implicit", None, 2, 16)).max() > 5e-4
+
+
+def test_repulsion_moves_them_the_same_by_both_solvers():
+    """The neighbour's double layer is of velocities with the repulsion in them, once."""
+    X = smooth_pair()
+    rate = shear_of(X)
+    marched = lambda solver, **options: march(make(solver, [5.0, 0.2], shear(rate), 2, **options), X, 0.02 / rate, 2).X
+    implicit, split = (marched(solver, repulsion=Repulsion(0.5, 2e3)) for solver in SOLVERS)
+    assert np.abs(implicit - split).max() < 0.03 * np.abs(implicit - marched("implicit")).max()
 
 
 @pytest.mark.parametrize("contrast", [5.0, 0.2])
