@@ -38,7 +38,7 @@ PRESETS = {
             "solver": {"kind": "split", "dtype": "float32", "near_tolerance": 1e-5, "far_tolerance": 1e-5},
         },
         (0.02, 0.005),
-        "positions within 1 % of R over 10 t_gamma for one or two vesicles, 16 to 51 times cheaper than reference; in dense suspensions, "
+        "positions within 1 % of R over 10 t_gamma for one or two vesicles, 20 to 44 times cheaper than reference; in dense suspensions, "
         "where differences grow tenfold in 3 t_gamma, within 1 % of R over 1 t_gamma, and numbers of vesicles beyond",
     ),
     "reference": Preset(
