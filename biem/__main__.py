@@ -191,7 +191,7 @@ def field(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="A .png, .gif, .mp4, .h5, or .csv of points; default TRAJECTORY.field.png.")
     ] = None,
-    frames: Annotated[str | None, typer.Option("--frames", help='"-1", "3,5", "0:100:10", "all"; default the last, of movies all.')] = None,
+    frames: Annotated[str | None, typer.Option("--frames", help='"-1", "3,5", "0:200:10", "all"; default the last, of movies all.')] = None,
     grid: GridShape = None,
     box: GridBox = None,
     points: Annotated[Path | None, typer.Option("--points", help="Text file of rows x y, in place of a grid.", metavar="FILE")] = None,
@@ -224,7 +224,7 @@ def export(
     trajectory: TrajectoryPath,
     vtkhdf: Annotated[bool, typer.Option("--vtkhdf", help="As VTKHDF, for ParaView 5.12 or newer.")] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; default TRAJECTORY.vtkhdf.")] = None,
-    frames: Annotated[str, typer.Option("--frames", help='"-1", "3,5", "0:100:10" or "all".')] = "all",
+    frames: Annotated[str, typer.Option("--frames", help='"-1", "3,5", "0:200:10" or "all".')] = "all",
     grid: GridShape = None,
     box: GridBox = None,
     quantities: FieldQuantities = None,
