@@ -15,6 +15,7 @@ import json
 import platform
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -84,7 +85,7 @@ def measure(points: int, side: int, repetitions: int) -> dict[str, object]:
     with fft_backend(problem.X.size):
         at = instant(problem, problem.X)
         flow = FlowField(problem, at)
-        times = {name: seconds(lambda kind=kind: flow.values(x, kind), repetitions) for name, kind in KINDS.items()}  # type: ignore[misc]
+        times = {name: seconds(partial(flow.values, x, kind), repetitions) for name, kind in KINDS.items()}
         times["instant"] = seconds(lambda: instant(problem, problem.X), repetitions)
         times["step of tracers"] = seconds(steps_of_tracers(problem, some[: CHECKED // 2], flow), repetitions)
         found, exact = (FlowField(problem, at, tolerance, True).values(some, QUANTITIES) for tolerance in (flow.tolerance, 1e-11))

@@ -20,11 +20,11 @@ import numpy as np
 from biem.observe.observables import Observations, join
 from biem.observe.quantities import QUANTITIES, Place, Quantity
 from biem.run.files import atomic_h5, one_line, write_atomically
+from biem.run.growing import Growing, read_growing
 
 SCHEMA = "observables 1"
 PLACES: tuple[Place, ...] = ("suspension", "vesicles", "pairs", "bins")
 ENDINGS = (".csv", ".h5")
-MERGE_AT = 64  # files of loose rows, at least; more where the file is longer, so that merging costs a constant factor
 
 
 def check_ending(path: Path) -> None:
@@ -50,16 +50,7 @@ def write_observations(path: Path, rows: Observations) -> list[Path]:
 
 def read_observations(path: Path) -> Observations:
     """All committed rows of an HDF5 file of observables, finished or growing. Raises ValueError if it is none."""
-    while True:
-        before = path.stat().st_ino if path.exists() else None
-        whole = _read_h5(path)
-        done = int(whole.step[-1]) if len(whole) else -1
-        try:
-            loose = [_read_h5(file) for file in _loose(path)]
-        except FileNotFoundError:  # merged meanwhile
-            continue
-        if (path.stat().st_ino if path.exists() else None) == before:
-            return join([whole, *(p for p in loose if p.about.get("run") == whole.about.get("run") and int(p.step[0]) > done)])
+    return join(read_growing(path, _folder(path), _read_h5, lambda rows: rows.about.get("run")))
 
 
 def are_observations(path: Path) -> bool:
@@ -71,38 +62,13 @@ def are_observations(path: Path) -> bool:
         return False
 
 
-class ObservationWriter:
+class ObservationWriter(Growing):
     """Adds rows to an HDF5 file; what is added is on the disk when `append` returns, `close` leaves one plain file."""
 
     def __init__(self, path: Path, rows: Observations) -> None:
         """Starts the file with rows, replacing what was there."""
-        self.path = path
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
-        _write_h5(path, rows)
-        shutil.rmtree(_folder(path), ignore_errors=True)
-        self._merged = len(rows)
-        self._pending = 0
-
-    def append(self, rows: Observations) -> None:
-        """Commits rows, which are later than those before."""
-        _folder(self.path).mkdir(exist_ok=True)
-        _write_h5(_folder(self.path) / f"{int(rows.step[0]):012d}.h5", rows)
-        self._pending += 1
-        if self._pending >= max(MERGE_AT, self._merged):
-            self._merge()
-
-    def close(self) -> None:
-        """Merges what is loose."""
-        if self._pending:
-            self._merge()
-        shutil.rmtree(_folder(self.path), ignore_errors=True)
-
-    def _merge(self) -> None:
-        everything = read_observations(self.path)
-        _write_h5(self.path, everything)
-        for file in _loose(self.path):
-            file.unlink()
-        self._merged, self._pending = len(everything), 0
+        super().__init__(path, _folder(path), rows, read_observations, _write_h5)
 
 
 def remove(path: Path) -> None:
@@ -113,10 +79,6 @@ def remove(path: Path) -> None:
 
 def _folder(path: Path) -> Path:
     return path.with_name(path.name + ".rows")
-
-
-def _loose(path: Path) -> list[Path]:
-    return sorted(_folder(path).glob("[0-9]*.h5"))
 
 
 def _write_h5(path: Path, rows: Observations) -> None:

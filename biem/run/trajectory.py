@@ -9,7 +9,6 @@ While a run is writing, new frames lie one file each in out.h5.frames/ and are m
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,12 +19,12 @@ import numpy as np
 
 from biem.curves.lattice import Box, Lattice
 from biem.run.files import atomic_h5, one_line
+from biem.run.growing import Growing, read_growing
 
 SCHEMA = 1
 REQUIRED = ("area_error", "length_error", "bending_energy", "gmres_iterations", "wall_seconds", "min_gap")
 DIAGNOSTICS = (*REQUIRED, "dt", "error_estimate", "rejected", "repulsion_work")
 MONITORED = ("out_of_distribution", "by_exact_maps")  # numbers of vesicles: of maps that watch over their validity
-MERGE_AT = 64  # loose frames, at least; more where the file is longer, so that merging costs a constant factor
 
 
 @dataclass(frozen=True)
@@ -97,20 +96,11 @@ def join(parts: list[Trajectory], attributes: Mapping[str, Any]) -> Trajectory:
 def read_trajectory(path: str | Path) -> Trajectory:
     """All committed frames of a trajectory file, finished or being written. Raises ValueError if it is none."""
     path = Path(path)
-    while True:
-        before = _identity(path)
-        whole = _read(path)
-        done = int(whole.step[-1]) if len(whole) else -1
-        try:
-            loose = [_read(frame) for frame in _loose(path)]
-        except FileNotFoundError:  # merged meanwhile
-            continue
-        if _identity(path) == before:  # the file is replaced before the frames that it took in are removed
-            mine = [p for p in loose if p.attributes.get("run") == whole.attributes.get("run") and int(p.step[0]) > done]
-            return join([whole, *mine], whole.attributes)
+    pieces = read_growing(path, _folder(path), _read, lambda frames: frames.attributes.get("run"))
+    return join(pieces, pieces[0].attributes)
 
 
-class TrajectoryWriter:
+class TrajectoryWriter(Growing):
     """Appends frames to `path`; `close` leaves one plain file."""
 
     def __init__(self, path: Path, attributes: Mapping[str, Any], frames: list[Trajectory]) -> None:
@@ -118,37 +108,10 @@ class TrajectoryWriter:
 
         The attribute "run" tells its loose frames from those of a run that it replaces.
         """
-        self.path = path
         self.attributes = dict(attributes)
-        merged = join(frames, self.attributes)
-        self._write(path, merged)
-        shutil.rmtree(_folder(path), ignore_errors=True)
-        self._merged = len(merged)
-        self._pending = 0
+        super().__init__(path, _folder(path), join(frames, self.attributes), read_trajectory, self._write_frames)
 
-    def append(self, frame: Trajectory) -> None:
-        """Commits one frame."""
-        folder = _folder(self.path)
-        folder.mkdir(exist_ok=True)
-        self._write(folder / f"{int(frame.step[0]):012d}.h5", frame)
-        self._pending += 1
-        if self._pending >= max(MERGE_AT, self._merged):
-            self._merge()
-
-    def close(self) -> None:
-        """Merges what is loose."""
-        if self._pending:
-            self._merge()
-        shutil.rmtree(_folder(self.path), ignore_errors=True)
-
-    def _merge(self) -> None:
-        everything = read_trajectory(self.path)
-        self._write(self.path, everything)
-        for frame in _loose(self.path):
-            frame.unlink()
-        self._merged, self._pending = len(everything), 0
-
-    def _write(self, path: Path, frames: Trajectory) -> None:
+    def _write_frames(self, path: Path, frames: Trajectory) -> None:
         with atomic_h5(path) as file:
             for name in ("t", "step", "X"):
                 file[name] = getattr(frames, name)
@@ -173,10 +136,6 @@ def exists(path: Path) -> bool:
 
 def _folder(path: Path) -> Path:
     return path.with_name(path.name + ".frames")
-
-
-def _loose(path: Path) -> list[Path]:
-    return sorted(_folder(path).glob("[0-9]*.h5"))
 
 
 def _read(path: Path) -> Trajectory:
@@ -204,12 +163,3 @@ def _read(path: Path) -> Trajectory:
         if not path.exists():
             raise FileNotFoundError(f"trajectory {path} does not exist") from None
         raise ValueError(f"{path} cannot be read as HDF5: {one_line(error)}") from None
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Changes whenever the file is replaced."""
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return None
-    return found.st_ino, found.st_mtime_ns

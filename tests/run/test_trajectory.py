@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scene_helpers import PAIR, assert_prefix, assert_same_frames, scene_of
 
+from biem.run import growing
 from biem.run import trajectory as module
 from biem.run.simulate import simulate
 from biem.run.trajectory import TrajectoryWriter, exists, join, one_frame, read_trajectory
@@ -28,7 +29,7 @@ def frames(n):
 
 @pytest.fixture
 def writer(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "MERGE_AT", 3)
+    monkeypatch.setattr(growing, "MERGE_AT", 3)
     return TrajectoryWriter(tmp_path / "out.h5", {"schema": 1, "seed": 7}, [frame(0)])
 
 
@@ -49,8 +50,8 @@ def test_frames_are_there_at_once_and_merged_in_the_end(tmp_path, writer):
 
 
 def test_merging_costs_a_constant_factor(writer, monkeypatch):
-    written, write = [], TrajectoryWriter._write
-    monkeypatch.setattr(TrajectoryWriter, "_write", lambda self, path, part: (written.append(len(part)), write(self, path, part)))
+    written, write = [], writer._write
+    monkeypatch.setattr(writer, "_write", lambda path, part: (written.append(len(part)), write(path, part)))
     for k in range(1, 60):
         writer.append(frame(k))
     writer.close()
