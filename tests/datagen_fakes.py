@@ -17,10 +17,10 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from limits import LIMIT
 from typer.testing import CliRunner
 
 MPIRUN = Path(sys.executable).parent / "mpirun"
-LIMIT = 60  # s, after which a run counts as hanging
 POINTS, MODES, RUNS, SHAPES = 16, 4, 4, 3  # of every harvested shard: RUNS runs with SHAPES shapes each
 SAID = "coverage of {n} shapes"
 CONFIG = """

@@ -11,13 +11,13 @@ from functools import partial
 from pathlib import Path
 
 from datagen_fakes import WRONG
+from limits import LIMIT
 
 from biem.ranks import world
 from datagen.jobs import run_tasks
 from datagen.stop import stoppable
 
 TASKS = 40
-LIMIT = 30  # s, for all ranks to have begun
 ROUNDS = {  # how, and on which rank, or of which task
     "fine": {},
     "raise": {"task": 5},

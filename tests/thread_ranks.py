@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
 import numpy as np
+from limits import LIMIT
 
 from biem.ranks import Ranks
 
@@ -13,7 +14,7 @@ class Together:
 
     def __init__(self, size):
         self.size = size
-        self.barrier = Barrier(size, timeout=20)
+        self.barrier = Barrier(size, timeout=LIMIT)
         self.board = [None] * size
 
     def of(self, rank):

@@ -7,7 +7,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from datagen_fakes import CHUNKS, LIMIT, MPIRUN, TASKS, command, contents, ranks_run, run
+from datagen_fakes import CHUNKS, MPIRUN, TASKS, command, contents, ranks_run, run
+from limits import LIMIT
 from scene_helpers import error_line
 
 from datagen.manifest import read_manifests

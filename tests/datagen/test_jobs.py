@@ -9,8 +9,9 @@ import threading
 from pathlib import Path
 
 import pytest
-from datagen_fakes import LIMIT, MPIRUN, WRONG
+from datagen_fakes import MPIRUN, WRONG
 from jobs_program import ROUNDS, TASKS
+from limits import LIMIT
 
 from biem.backend import threads
 from datagen.jobs import one_thread, run_tasks

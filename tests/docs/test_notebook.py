@@ -3,6 +3,7 @@
 import nbformat
 import pytest
 from doc_examples import ROOT
+from limits import LIMIT
 from nbclient import NotebookClient
 from scene_helpers import cli
 
@@ -29,7 +30,7 @@ def test_it_runs(notebook, tmp_path):
     scene = [tmp_path / "shear_pair.toml", "--accuracy", "fast", "--set", "time.horizon=0.5 t_gamma", "--set", "time.save_every=1"]
     assert cli("run", *scene, "-o", tmp_path / "out" / "shear_pair.h5", "--quiet").exit_code == 0
     executed = nbformat.from_dict(notebook)
-    NotebookClient(executed, timeout=120, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
+    NotebookClient(executed, timeout=LIMIT, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
     outputs = [output for cell in executed.cells if cell.cell_type == "code" for output in cell.outputs]
     printed = "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
     assert "frames of 2 vesicles with 32 nodes, to 0.5 t_gamma" in printed

@@ -10,6 +10,7 @@ from urllib.parse import unquote, urldefrag, urljoin, urlparse
 
 import pytest
 from browsers import browser
+from limits import LIMIT
 from website import sources
 from website.formulas import draw_formulas, formula
 from website.plain_docstrings import plain
@@ -36,7 +37,7 @@ def site(tmp_path_factory, formulas):
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
     environment = {"PYTHONPATH": f"{ROOT / 'scripts'}:{ROOT}", "PATH": str(Path(sys.executable).parent), "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
 

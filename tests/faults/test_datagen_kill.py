@@ -8,7 +8,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from datagen_fakes import CHUNKS, LIMIT, MPIRUN, TASKS, command, contents, run, start
+from datagen_fakes import CHUNKS, MPIRUN, TASKS, command, contents, run, start
+from limits import LIMIT
 from scene_helpers import die_at
 
 pytest.importorskip("mpi4py")

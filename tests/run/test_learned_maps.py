@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from learned_stub import VESNET, WatchedMaps, put_in_place, seen_in
+from limits import LIMIT
 from PIL import Image
 from scene_helpers import DT, PAIR, assert_same_frames, cli, scene_of, stop_after, the_error, write_scene
 
@@ -145,7 +146,7 @@ def test_maps_that_are_exact_import_no_provider(monkeypatch, case):
 
 def test_biem_loads_no_networks_before_a_scene_asks_for_them():
     program = "import sys, biem, biem.__main__; print([m for m in sys.modules if m.partition('.')[0] in ('surrogate', 'torch')])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=LIMIT)
     assert done.stdout.strip() == "[]"
 
 

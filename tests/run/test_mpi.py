@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from limits import LIMIT
 from scene_helpers import DT, cli, error_line, write_flow, write_scene
 from thread_ranks import Together, on_threads
 
@@ -21,7 +22,6 @@ pytest.importorskip("mpi4py")
 MPIRUN = Path(sys.executable).parent / "mpirun"
 pytestmark = pytest.mark.skipif(not MPIRUN.exists(), reason="no mpirun beside the interpreter")
 
-LIMIT = 60  # s, after which a run counts as hanging
 STEPS = 4
 TEN = {
     "vesicles": {"placement": "grid", "reduced_area": 0.65, "points": 32, "count": 10, "area_fraction": 0.25},
@@ -120,7 +120,14 @@ def assert_close_frames(a, b, scale=1.0):
 
 
 @pytest.fixture(scope="module")
-def of_three(tmp_path_factory):
+def wholes(tmp_path_factory):
+    """The frames of each way by one process, which compiles what the others then load."""
+    folders = {name: tmp_path_factory.mktemp("one") for name in WAYS}
+    return {name: whole_run(folder, write_scene(folder, TEN, WAYS[name])) for name, folder in folders.items()}
+
+
+@pytest.fixture(scope="module")
+def of_three(tmp_path_factory, wholes):
     """A folder of runs on three processes: of each way, and of what three processes are too many for. What became of them, by name."""
     folder = tmp_path_factory.mktemp("three")
     paths = {}
@@ -132,14 +139,14 @@ def of_three(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("processes", "way"), [(1, "order 1"), (2, "order 2"), *((3, way) for way in WAYS)])
-def test_any_number_of_processes_gives_the_trajectory_of_one_and_speaks_once(tmp_path, of_three, processes, way):
+def test_any_number_of_processes_gives_the_trajectory_of_one_and_speaks_once(tmp_path, wholes, of_three, processes, way):
     if processes == 3:
-        path, out, (exit_code, printed, bars) = of_three[way]
+        _, out, (exit_code, printed, bars) = of_three[way]
     else:
         path, out = write_scene(tmp_path, TEN, WAYS[way]), tmp_path / "out.h5"
         exit_code, printed, bars = mpi(processes, "run", path, "-o", out)
     assert exit_code == 0, bars
-    done, whole = read_trajectory(out), whole_run(tmp_path, path)
+    done, whole = read_trajectory(out), wholes[way]
     assert len(whole) > 2
     assert_close_frames(done, whole)
     for name in ("area_error", "length_error", "bending_energy", "min_gap", "dt", "rejected"):

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import shapely
+from limits import LIMIT
 from scene_helpers import DT, assert_same_frames, cli, scene_of, stop_after, the_error, write_flow, write_scene
 
 from biem.curves.curve import area, length
@@ -199,7 +200,7 @@ def test_several_processes_give_the_same(tmp_path):
     path = write_scene(tmp_path, vesicles=vesicles, time={"dt": DT / 8, "horizon": 3 * DT / 8}, **tables)
     command = [mpirun, "-n", 2, sys.executable, "-m", "biem", "run", path, "-o", tmp_path / "two.h5", "--quiet"]
     done = subprocess.run(
-        [str(c) for c in command], env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False, timeout=100
+        [str(c) for c in command], env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False, timeout=LIMIT
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert cli("run", path, "-o", tmp_path / "one.h5", "--quiet").exit_code == 0

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from limits import LIMIT
 from scene_helpers import PAIR, cli, error_line, scene_of, the_error, write_scene
 
 import biem.run.solver as solver
@@ -94,7 +95,7 @@ def without(folder, *modules):
 
 def process(folder, *arguments, environment=None):
     command = [sys.executable, "-m", "biem", *map(str, arguments)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=LIMIT)
 
 
 def test_ewald_without_finufft_names_the_extra_and_auto_does_without(tmp_path):

@@ -7,6 +7,7 @@ import sys
 import h5py
 import numpy as np
 import pytest
+from limits import LIMIT
 from PIL import Image
 from scene_helpers import DT, PAIR, cli, scene_of, the_error
 
@@ -243,12 +244,12 @@ def test_writers_take_scalars_vectors_and_tensors(tmp_path):
 def test_the_export_is_rendered_without_a_display(tmp_path, exported):
     script = importlib.util.find_spec("render_vtkhdf").origin
     command = [sys.executable, script, exported / "out.vtkhdf", "-o", tmp_path / "a.png", "--field", "pressure"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     assert done.returncode == 0, done.stderr
     assert "one of 4 steps" in done.stdout
     picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"))
     middle = picture[: picture.shape[0] // 2].reshape(-1, 3)
     assert len(np.unique(middle, axis=0)) > 200
-    bad = subprocess.run([*command[:-1], "heat"], capture_output=True, text=True, timeout=120, check=False)
+    bad = subprocess.run([*command[:-1], "heat"], capture_output=True, text=True, timeout=LIMIT, check=False)
     assert bad.returncode == 2
     assert 'there is no "heat"' in bad.stderr.splitlines()[-1]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from limits import LIMIT
 from scene_helpers import DT, PAIR, cli, scene_of, table, write_scene
 
 from biem.run.simulate import simulate
@@ -227,7 +228,7 @@ def test_memory_estimate_is_what_a_step_takes():
     """Within a factor of 3 of the measured growth of the peak."""
     program = STEP_OF_MANY.format(tests=str(Path(__file__).parent), M=500)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, timeout=LIMIT)
     measured, estimated = map(float, done.stdout.split())
     assert measured > 10e6
     assert 1 / 3 < estimated / measured < 3, (measured, estimated)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from datagen_fakes import MPIRUN
+from limits import LIMIT
 from typer.testing import CliRunner
 
 import surrogate.train
@@ -19,7 +20,6 @@ from surrogate.weights import read_weights
 
 ROOT = Path(__file__).parents[2]
 QUICK = ["--set", "training.samples=64", "--set", "training.batch=16", "--set", "training.every=2", "--set", "network.width=8"]
-LIMIT = 120
 
 
 def start(*arguments, launcher=(), **environment):
