@@ -52,7 +52,7 @@ def test_merged_networks_answer_as_each_alone(name, norm):
     X = curves()
     y = whole(X)
     own = torch.cat([part(X) for part in parts], dim=1)
-    assert relative(y, own) < (1e-6 if norm == "none" else 1e-5)
+    assert relative(y, own) < 1e-5  # float32, in whatever order a processor adds
     assert min(relative(own[:, [k]], own[:, [k - 1]]) for k in range(1, 5)) > 0.1
 
 
