@@ -6,7 +6,7 @@ python scripts/reproduce.py taylor_green --collect                   # runs noth
 python scripts/reproduce.py all                                      # everything: days on two cores
 python scripts/reproduce.py report                                   # docs/reproduction.md and its figures
 
-A run that is finished is not repeated, one that was stopped goes on.
+A run that is finished is not repeated, one that was stopped goes on. The report keeps what it said of experiments that are not in -o.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from reproductions.study import ROOT, Results, Study
+from reproductions.study import MISSING, ROOT, Results, Study
 from studies.rungs import split_list
 
 from biem.cli import one_line_errors
@@ -87,26 +87,40 @@ def main(
 
 
 def report(study: Study, docs: Path) -> Path:
-    """reproduction.md, with the pictures in images/, of what there is of all experiments."""
-    images = docs / "images"
+    """reproduction.md, with the pictures in images/, of what there is of all experiments; of the others as it was."""
+    images, path = docs / "images", docs / "reproduction.md"
     images.mkdir(parents=True, exist_ok=True)
+    before = _sections(path.read_text() if path.exists() else "")
     parts = [HEAD.format(names=", ".join(EXPERIMENTS))]
     for name, title in EXPERIMENTS.items():
         module = import_module(f"reproductions.{name}")
         results: Results = module.measure(study)
-        parts.append(f"## {title}\n\n`python scripts/reproduce.py {name}`\n")
-        if not results:
-            parts.append("Not run yet.\n")
+        head = f"## {title}\n\n`python scripts/reproduce.py {name}`\n"
+        if _empty(results):
+            parts.append(before.get(title, f"{head}\nNot run yet.\n"))
             continue
+        parts.append(head)
         pictures = []
         for picture in results["pictures"]:
             target = images / f"reproduction_{name}_{picture}"
             shutil.copyfile(study.folder(name) / picture, target)
             pictures.append(f"![{title}](images/{target.name})")
         parts.append("\n\n".join([module.section(results), *pictures]) + "\n")
-    path = docs / "reproduction.md"
     write_atomically(path, "\n".join(parts).encode())
     return path
+
+
+def _empty(results: Results) -> bool:
+    """Whether nothing of an experiment was run."""
+    rows = results.get("rows", {})
+    states = [row.get("state") for row in (rows.values() if isinstance(rows, dict) else rows)]
+    return not results or (bool(states) and set(states) == {MISSING})
+
+
+def _sections(page: str) -> dict[str, str]:
+    """The parts of the page by their titles."""
+    parts = [f"## {part}" for part in page.split("\n## ")[1:]]
+    return {part.partition("\n")[0].removeprefix("## "): part for part in parts}
 
 
 if __name__ == "__main__":

@@ -10,8 +10,10 @@ from reproductions import near, poiseuille, shear, study, taylor_green
 from studies.rungs import rung
 from typer.testing import CliRunner
 
+from biem.curves.curve import area, centroid, length
 from biem.curves.shapes import equilibrium, place
 from biem.run.trajectory import Trajectory, TrajectoryWriter
+from biem.scene.build import build
 
 R = 0.128314817
 
@@ -109,6 +111,18 @@ def test_scenes_are_those_that_long_runs_were_made_with():
     assert made.scene.vesicles.centers == [(0.0, 2.5)]
 
 
+def test_rungs_start_at_the_reference_with_its_area_and_length(tmp_path):
+    X = place(equilibrium(128, 0.65), (3.0, 0.04), 0.7)[None]
+    start = poiseuille.start_file(X, tmp_path / "starts" / "a.h5")
+    scene = poiseuille.scene("vesnet:hybrid", 0.4, 30, start).scene
+    own = build(scene).X
+    assert own.shape == (1, 2, 32)
+    assert area(own) == pytest.approx(area(X), rel=1e-10)
+    assert length(own) == pytest.approx(length(X), rel=1e-10)
+    assert centroid(own)[0] == pytest.approx([3.0, 0.04], abs=1e-5)
+    assert scene.time.horizon == f"{poiseuille.FROM_REST} t_gamma"
+
+
 def test_uncorrected_rungs():
     assert shear.uncorrected("vesnet:mlp") == 'vesnet:mlp[solver.near_field="none"]'
     assert shear.uncorrected("split[vesicles.points=32]") == 'split[vesicles.points=32,solver.near_field="none"]'
@@ -154,3 +168,5 @@ def test_a_quick_run_is_kept_and_reported_with_what_is_missing(tmp_path):
     assert "Not run yet." in text  # of timing
     for picture in set(part.partition(")")[0] for part in text.split("](")[1:] if part.startswith("images/")):
         assert (tmp_path / "docs" / picture).stat().st_size > 1000
+    again = report(study.Study(tmp_path / "elsewhere", collect=True, quick=True), tmp_path / "docs")
+    assert again.read_text() == text  # what is said of experiments whose runs are not there stays
