@@ -5,6 +5,7 @@ python scripts/extremes.py --only gap --solvers implicit,split  some of them
 python scripts/extremes.py --only steps --only vesicles --long  1e5 steps of one vesicle, 10,000 vesicles: hours
 
 Cases lie under -o, one JSON each with its runs; those that are there are not repeated. --again repeats what was refused or ill-behaved.
+What the page says of cases that are not under -o comes from docs/extremes.json, where all outcomes are kept.
 Exit codes: 0 all well-behaved, 2 bad input, 3 some are not.
 """
 
@@ -17,6 +18,7 @@ from typing import Annotated
 import typer
 from studies.extremes_grid import AXES, RUNGS, Case, grid, write_inputs
 from studies.extremes_judge import ILL, Outcome, outcome_path, read_outcome, settle
+from studies.extremes_kept import completed, keep
 from studies.extremes_page import page
 from studies.extremes_steps import AXIS as STEP_SIZES
 from studies.extremes_steps import draw, ladders, measure, measured
@@ -66,10 +68,11 @@ def _settled(cases: Sequence[Case], folder: Path, again: bool) -> list[Outcome]:
 
 
 def _write(docs: Path, folder: Path) -> None:
-    """The page and its figure, of all cases that are there."""
-    found = {case: read_outcome(outcome_path(case, folder)) for case in grid()}
-    steps = measured(folder)
+    """The page and its figure, of all cases that are there, and of the others from extremes.json as the page before had them."""
+    there = {case: read_outcome(outcome_path(case, folder)) for case in grid()}
     (docs / "images").mkdir(parents=True, exist_ok=True)
+    found, steps = completed(there, measured(folder), docs / "extremes.json")
+    keep(found, steps, docs / "extremes.json")
     if steps:
         draw(steps, docs / "images" / "extremes_steps.png")
     write_atomically(docs / "extremes.md", page(found, steps).encode())

@@ -80,10 +80,14 @@ def outcome_path(case: Case, folder: Path) -> Path:
 def read_outcome(path: Path) -> Outcome | None:
     """The outcome in that file, or None where there is none."""
     try:
-        table = json.loads(path.read_text())
-        return Outcome(**{**table, "attempts": [Attempt(**attempt) for attempt in table["attempts"]]})
+        return outcome_of(json.loads(path.read_text()))
     except (FileNotFoundError, json.JSONDecodeError, TypeError, KeyError):
         return None
+
+
+def outcome_of(table: dict) -> Outcome:
+    """Inverse of `asdict`."""
+    return Outcome(**{**table, "attempts": [Attempt(**attempt) for attempt in table["attempts"]]})
 
 
 def settle(case: Case, folder: Path, again: bool = False) -> Outcome:

@@ -117,6 +117,11 @@ def measured(folder: Path) -> list[Measured]:
     return [_read(path) for ladder in ladders() if (path := _path(ladder, folder)).exists()]
 
 
+def measured_of(table: dict) -> Measured:
+    """Inverse of `asdict`."""
+    return Measured(Ladder(**table["ladder"]), [Tried(**step) for step in table["tried"]])
+
+
 def draw(found: Sequence[Measured], path: Path) -> None:
     """A panel for every capillary number: largest stable step (open) and largest accurate one (filled) by nodes and rung."""
     figure = Figure(figsize=(3.2 * len(CAPILLARIES), 4.2), layout="constrained")
@@ -196,5 +201,4 @@ def _path(ladder: Ladder, folder: Path) -> Path:
 
 
 def _read(path: Path) -> Measured:
-    table = json.loads(path.read_text())
-    return Measured(Ladder(**table["ladder"]), [Tried(**step) for step in table["tried"]])
+    return measured_of(json.loads(path.read_text()))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from comparison_cases import kept_here
 from studies.extremes_grid import AXES, RUNGS, Against, Case, by_rung, facing, grid, merged, pair, radius, times, write_inputs
-from studies.extremes_judge import FINISHED, ILL, REFUSED, SMALLER, Outcome, _moved, outcome_path, problems_in, said_badly, settle
+from studies.extremes_judge import FINISHED, ILL, REFUSED, SMALLER, Attempt, Outcome, _moved, outcome_path, problems_in, said_badly, settle
+from studies.extremes_kept import completed, keep
 from studies.extremes_page import page
 from studies.extremes_steps import Ladder, Measured, Tried, draw, ladders, measured
 from studies.runs import Record
@@ -152,3 +153,20 @@ def test_page_and_figure_of_what_is_there(tmp_path):
     draw(steps, tmp_path / "steps.png")
     assert (tmp_path / "steps.png").stat().st_size > 10_000
     assert measured(tmp_path) == []
+
+
+def test_what_is_not_run_again_stays_as_it_was(tmp_path):
+    cases, path = [case for case in grid() if case.axis == "gap"], tmp_path / "extremes.json"
+    attempt = Attempt("as given", '{"name": "long"}', 3, "step 1 rejected")
+    old, other = (
+        Outcome("gap", value, "implicit", REFUSED, "", "line", [], [attempt], error) for value, error in (("0.1", 1.0), ("0.01", 2.0))
+    )
+    up, down = (Measured(ladder, [Tried(0.02, True, 0.002), Tried(0.04, False, None, "x")]) for ladder in ladders()[:2])
+    keep(dict.fromkeys(cases) | {cases[0]: old, cases[1]: other}, [up, down], path)
+    assert "long" not in path.read_text()
+    new, again = replace(old, error=3.0), replace(up, tried=[Tried(0.08, True, 0.1)])
+    found, steps = completed(dict.fromkeys(cases) | {cases[0]: new}, [again], path)
+    assert [found[case] and found[case].error for case in cases[:3]] == [3.0, 2.0, None]
+    assert found[cases[1]].attempts == [replace(attempt, scene="")]
+    assert {m.ladder: m for m in steps} == {up.ladder: again, down.ladder: down}
+    assert completed(found, steps, tmp_path / "none.json") == (found, steps)
