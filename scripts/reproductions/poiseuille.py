@@ -25,9 +25,22 @@ from biem.curves.fourier import resample
 from biem.curves.reparam import redistribute
 from biem.run.files import atomic_h5
 from biem.run.trajectory import Trajectory
-from biem.scene.config import make_scene
 from reproductions.pictures import color, figure, fill, label, save
-from reproductions.study import FINISHED, MISSING, SCENES, Found, Results, Study, Task, ended, found, gather, table, write_results
+from reproductions.study import (
+    FINISHED,
+    MISSING,
+    SCENES,
+    Found,
+    Results,
+    Study,
+    Task,
+    ended,
+    found,
+    from_file,
+    gather,
+    table,
+    write_results,
+)
 
 NAME = "poiseuille"
 REFERENCE, SPLIT, NETWORK = "implicit[vesicles.points=128]", "split[vesicles.points=32]", "vesnet:hybrid"
@@ -59,9 +72,7 @@ def scene(name: str, cn: float, ca: float, start: Path | None = None, quick: boo
     if quick:
         overrides += [f'time.horizon="{4 * dt} t_gamma"', "time.save_every=1"]
     made = rung(SCENES / "poiseuille_single.toml", name, overrides)
-    if start is None:
-        return made
-    return Rung(name, make_scene({**made.scene.model_dump(mode="json"), "vesicles": {"file": start.name}}, start.parent))
+    return made if start is None else from_file(made, start)
 
 
 def measure(study: Study) -> Results:

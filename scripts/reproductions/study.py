@@ -111,6 +111,11 @@ def scene_rung(scene: Path, name: str, overrides: Sequence[str], horizon: str | 
     return rung(scene, name, [*overrides, *([f'time.horizon="{horizon}"'] if horizon else [])])
 
 
+def from_file(made: Rung, path: Path) -> Rung:
+    """A rung that begins with the shapes in a file, which lies beside its scene."""
+    return Rung(made.name, make_scene({**made.scene.model_dump(mode="json"), "vesicles": {"file": path.name}}, path.parent))
+
+
 def gather(study: Study, tasks: Mapping[str, Task], ending: str = "", desc: str = "runs") -> dict[str, Found]:
     """Makes the runs that are asked for and not there, then says what there is of all. Raises NumericalFailure if a process dies."""
     now = {name: (task.scene, task.path) for name, task in tasks.items() if study.runs(task.rung.name) and not _done(task)}

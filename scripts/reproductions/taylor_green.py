@@ -76,11 +76,11 @@ def left(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Times in t_gamma, EVERY apart from 0, and how many centroids are in the cell then."""
     unit, W = float(trajectory.attributes["t_gamma"]), float(trajectory.attributes["flow_width"])
     t = np.arange(0.0, trajectory.t[-1] / unit + 1e-9, EVERY)
-    c = _centroids(trajectory, t * unit)
+    c = centroids(trajectory, t * unit)
     return t, ((c >= 0.0) & (c <= W)).all(axis=2).sum(axis=1)
 
 
-def _centroids(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
+def centroids(trajectory: Trajectory, times: np.ndarray) -> np.ndarray:
     """(T, M, 2) at any times within the trajectory's."""
     c = np.stack([centroid(X) for X in trajectory.X])
     if len(c) < 4:
@@ -93,7 +93,7 @@ def _agreeing(trajectory: Trajectory, reference: Trajectory) -> float:
     unit = float(trajectory.attributes["t_gamma"])
     R = float(effective_radius(reference.X[0]).mean())
     t = np.arange(0.0, min(trajectory.t[-1], reference.t[-1]) / unit + 1e-9, EVERY)
-    far = np.linalg.norm(_centroids(trajectory, t * unit) - _centroids(reference, t * unit), axis=2).max(axis=1) > R
+    far = np.linalg.norm(centroids(trajectory, t * unit) - centroids(reference, t * unit), axis=2).max(axis=1) > R
     return float(t[np.argmax(far)] if far.any() else t[-1])
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reproduce import app, report
-from reproductions import near, poiseuille, shear, study, taylor_green
+from reproductions import near, poiseuille, scatter, shear, study, taylor_green
 from studies.rungs import rung
 from typer.testing import CliRunner
 
@@ -123,6 +123,17 @@ def test_rungs_start_at_the_reference_with_its_area_and_length(tmp_path):
     assert scene.time.horizon == f"{poiseuille.FROM_REST} t_gamma"
 
 
+def test_copies_begin_as_far_aside_as_is_said_and_their_growth_is_found():
+    X = np.stack([place(equilibrium(32, 0.65), c, 0.3) for c in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))])
+    moved = centroid(scatter.shifted(X, 1e-3, 1)) - centroid(X)
+    assert np.linalg.norm(moved, axis=1) == pytest.approx(1e-3 * R, rel=1e-6)
+    assert np.abs(scatter.shifted(X, 1e-3, 2) - scatter.shifted(X, 1e-3, 1)).max() > 1e-4 * R
+    t = np.arange(0.0, 20.5, 0.5)
+    apart = np.minimum(1e-6 * 10 ** (t / 3.0), 2.0)
+    assert scatter.tenfold(t, apart) == pytest.approx(3.0, rel=1e-6)
+    assert np.isnan(scatter.tenfold(t, np.full_like(t, 1e-6)))
+
+
 def test_uncorrected_rungs():
     assert shear.uncorrected("vesnet:mlp") == 'vesnet:mlp[solver.near_field="none"]'
     assert shear.uncorrected("split[vesicles.points=32]") == 'split[vesicles.points=32,solver.near_field="none"]'
@@ -164,7 +175,7 @@ def test_a_quick_run_is_kept_and_reported_with_what_is_missing(tmp_path):
     assert next(folder.glob("*.h5")).stat().st_mtime_ns == before
     text = path.read_text()
     assert '| implicit, N=32, near_field="none" | finished |' in text
-    assert text.count("## ") == 8
+    assert text.count("## ") == 9
     assert "Not run yet." in text  # of timing
     for picture in set(part.partition(")")[0] for part in text.split("](")[1:] if part.startswith("images/")):
         assert (tmp_path / "docs" / picture).stat().st_size > 1000
