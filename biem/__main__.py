@@ -214,7 +214,8 @@ def field(
         path = output or trajectory.with_suffix(".field.png")
         options = Options(frames, grid, box, points, quantities, show, streamlines, follow, disturbance, tolerance, folder)
         bar = (lambda frames: tqdm(frames, desc="field", unit="frame", leave=False)) if not quiet else iter
-        make_fields(trajectory, path, options, bar)
+        for notice in make_fields(trajectory, path, options, bar):
+            typer.echo(f"notice: {notice}", err=True)
         if not quiet:
             typer.echo(str(path))
 

@@ -20,9 +20,9 @@ import numpy as np
 from biem.curves.curve import center_of_nodes, curvature
 from biem.curves.fourier import resample
 from biem.observe.grid import Grid, frames_named, grid_shape
+from biem.run.derived import check_output, unfinished
 from biem.run.field_command import box_of
 from biem.run.fields import FrameFields, Request, check_memory, parts_of, quantities_named, remove_parts, sampled
-from biem.run.files import make_folder
 from biem.run.observe import problem_of
 from biem.run.trajectory import Trajectory, read_trajectory
 from biem.run.vtkhdf import write_image, write_polydata
@@ -73,12 +73,6 @@ def export_vtkhdf(source: Path, output: Path | None, options: ExportOptions, pro
     trajectory = read_trajectory(source)
     problem = problem_of(trajectory, options.folder)
     frames = frames_named(options.frames, len(trajectory))
-    notices = []
-    if trajectory.t[-1] < problem.horizon * (1 - 1e-9):
-        notices.append(
-            f"the run has not come to its horizon: the {len(trajectory)} frames that it has committed, to t = {trajectory.t[-1]:.6g} of "
-            f"{problem.horizon:.6g}, are what there is to export"
-        )
     quantities: tuple[str, ...] = ()
     grids: list[Grid] = []
     points = 0.0
@@ -91,7 +85,7 @@ def export_vtkhdf(source: Path, output: Path | None, options: ExportOptions, pro
     if options.grid is not None:
         grids = [Grid.of(box, shape)] * len(frames)
     request = Request(frames, quantities, grids, None, not options.shapes, options.disturbance, options.tolerance)
-    make_folder(output.parent)
+    check_output(output, source)
     found = list(sampled(trajectory, problem, request, parts_of(output), progress))
 
     files = [output]
@@ -110,7 +104,7 @@ def export_vtkhdf(source: Path, output: Path | None, options: ExportOptions, pro
         outlines, cells = _polylines([resample(X, 2 * X.shape[-1]).T for X in trajectory.attributes["walls"]])
         write_polydata(files[-1], t[:1], outlines[None], cells, "Lines", {}, {"wall": np.arange(len(cells))})
     remove_parts(output)
-    return Exported(files, notices)
+    return Exported(files, [*filter(None, [unfinished(trajectory, problem)])])
 
 
 def write_membranes(path: Path, trajectory: Trajectory, found: Sequence[FrameFields], refine: int | None = None) -> None:

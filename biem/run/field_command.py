@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from biem.observe.grid import Grid, box_around, frames_named, grid_shape, read_box
+from biem.run.derived import check_output, unfinished
 from biem.run.field_files import write_fields, write_table
 from biem.run.fields import Request, check_memory, parts_of, quantities_named, remove_parts, sampled
-from biem.run.files import make_folder
 from biem.run.observe import problem_of
 from biem.run.trajectory import Trajectory, read_trajectory
 from biem.scene.build import Problem
@@ -40,8 +40,10 @@ class Options:
     folder: Path = Path(".")
 
 
-def make_fields(source: Path, output: Path, options: Options, progress: Callable[[Any], Iterable[Any]] = iter) -> None:
-    """Writes `output`; what it is made of is told by its ending. An interrupted call leaves its frames, which the next one takes.
+def make_fields(source: Path, output: Path, options: Options, progress: Callable[[Any], Iterable[Any]] = iter) -> list[str]:
+    """Writes `output`; what it is made of is told by its ending. Returns what is to be said of it.
+
+    An interrupted call leaves its frames, which the next one takes.
 
     Raises ValueError or FileNotFoundError with one line for what is wrong, NumericalFailure where a tension is not found.
     """
@@ -50,7 +52,7 @@ def make_fields(source: Path, output: Path, options: Options, progress: Callable
     trajectory = read_trajectory(source)
     problem = problem_of(trajectory, options.folder)
     default = "all" if kind in MOVIES else "-1"
-    frames = frames_named(options.frames or default, len(trajectory))
+    frames = frames_named(default if options.frames is None else options.frames, len(trajectory))
     if kind in PICTURES and len(frames) > 1:
         raise ValueError(f"--frames {options.frames} names {len(frames)} frames, {kind} holds one: name one, or write a .gif or a .mp4")
     drawn = kind in (*PICTURES, *MOVIES)
@@ -65,7 +67,7 @@ def make_fields(source: Path, output: Path, options: Options, progress: Callable
         check_memory(problem, len(points), len(frames), quantities, True)
         grids = []
     request = Request(frames, quantities, grids, points, disturbance=options.disturbance, tolerance=options.tolerance)
-    make_folder(output.parent)
+    check_output(output, source)
     again = lambda bar=iter: sampled(trajectory, problem, request, parts_of(output), bar)
     if drawn:
         from biem.run.field_pictures import Painter  # matplotlib loads slowly: only where it is needed
@@ -83,6 +85,7 @@ def make_fields(source: Path, output: Path, options: Options, progress: Callable
         else:
             write_fields(output, request, found, about)
     remove_parts(output)
+    return [*filter(None, [unfinished(trajectory, problem)])]
 
 
 def box_of(trajectory: Trajectory, frames: list[int], text: str | None, follow: bool = False) -> tuple[float, float, float, float]:

@@ -16,9 +16,19 @@ import numpy as np
 from biem.run.fields import FrameFields, Request
 from biem.run.files import atomic_h5, write_atomically
 
-ABOUT = (
-    "inside: the vesicle that a point is in, -1 in the fluid between, -2 beyond a wall; stress = -pressure I + 2 mu E; limits from outside"
-)
+ABOUT = "on a membrane pressure, vorticity and stress are those of the fluid outside"
+MEANING = {  # unit and definition
+    "t": ("time", "of the frame"),
+    "frame": ("1", "number of the frame in the trajectory, from 0"),
+    "x": ("length", "of the grid's points"),
+    "y": ("length", "of the grid's points"),
+    "points": ("length", "x and y"),
+    "inside": ("1", "the vesicle that a point is in, from 0; -1 in the fluid between, -2 beyond a wall"),
+    "velocity": ("length/time", "u along x, v along y"),
+    "pressure": ("kappa_b/length^3", "p; 0 far away where the fluid is unbounded, up to a constant between walls"),
+    "vorticity": ("1/time", "omega = dv/dx - du/dy"),
+    "stress": ("kappa_b/length^3", "s = -p I + mu (grad u + grad u^T), mu that of the fluid there; rows and columns x, y"),
+}
 COLUMNS = {"velocity": ("u", "v"), "pressure": ("p",), "vorticity": ("omega",), "stress": ("s_xx", "s_xy", "s_yx", "s_yy")}
 
 
@@ -35,6 +45,8 @@ def write_fields(path: Path, request: Request, frames: Sequence[FrameFields], at
         for name in ("inside", *request.quantities):
             values = np.stack([frame.values[name] for frame in frames])
             file[name] = values.reshape(len(frames), *shape, *values.shape[2:])
+        for name, values in file.items():
+            values.attrs["unit"], values.attrs["definition"] = MEANING[name]
         file.attrs.update({"about": ABOUT, "disturbance": request.disturbance, "tolerance": request.tolerance, **attributes})
 
 
@@ -49,6 +61,9 @@ def write_table(path: Path, request: Request, frames: Sequence[FrameFields]) -> 
             columns += list(frame.values[name].reshape(request.size, -1).T)
         rows.append(np.stack(columns, axis=-1))
     text = io.StringIO()
+    about = {"t": ["t"], "points": ["x", "y"], "inside": ["inside"]} | {name: [*COLUMNS[name]] for name in request.quantities}
+    for name, columns_of in about.items():
+        text.write(f"# {', '.join(columns_of)} [{MEANING[name][0]}]: {MEANING[name][1]}\n")
     text.write(f"# {ABOUT}\n{','.join(names)}\n")
     form = ["%.17g", "%.17g", "%.17g", "%d", *("%.17g",) * (len(names) - 4)]
     np.savetxt(text, np.concatenate(rows), fmt=form, delimiter=",")

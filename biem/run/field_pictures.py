@@ -114,7 +114,8 @@ class Painter:
     def _draw(self, figure: Figure, axes: Any, frame: FrameFields, grid: Grid, with_bar: bool) -> None:
         shown = SHOWN[self.show]
         values = shown.values(frame.values[shown.quantity]).reshape(grid.shape)
-        extent = (grid.x[0], grid.x[-1], grid.y[0], grid.y[-1])
+        half = [0.5 * np.ptp(axis) / (len(axis) - 1) for axis in (grid.x, grid.y)]  # values are those at the centres of the pixels
+        extent = (grid.x[0] - half[0], grid.x[-1] + half[0], grid.y[0] - half[1], grid.y[-1] + half[1])
         colours = {"cmap": "RdBu_r" if shown.signed else "viridis", "norm": Normalize(*self.limits)}
         image = axes.imshow(values, origin="lower", extent=extent, interpolation="bilinear", **colours)
         if with_bar:
@@ -132,8 +133,8 @@ class Painter:
             x, lattice = self.trajectory.tracers[frame.frame], self.trajectory.lattice(frame.frame)
             x = x if lattice is None else lattice.wrapped(x)
             axes.plot(*x.T, "o", color="tab:orange", markeredgecolor="black", markeredgewidth=0.3, markersize=2.5, zorder=5)
-        axes.set_xlim(*extent[:2])
-        axes.set_ylim(*extent[2:])
+        axes.set_xlim(grid.x[0], grid.x[-1])
+        axes.set_ylim(grid.y[0], grid.y[-1])
         axes.set_xlabel("x [length]")
         axes.set_ylabel("y [length]")
         time, unit = _times(self.trajectory)

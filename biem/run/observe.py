@@ -14,6 +14,7 @@ import numpy as np
 from biem.backend import fft_backend, stage, to_numpy
 from biem.observe.observables import BINS, Observations, Observer, join
 from biem.observe.quantities import QUANTITIES, known
+from biem.run.derived import check_finite, check_output, unfinished
 from biem.run.files import make_folder
 from biem.run.observations import (
     ObservationWriter,
@@ -129,8 +130,9 @@ def observe_file(
     written = are_observations(source)
     output = output or source.with_suffix(".csv" if written else ".observables.csv")
     check_ending(output)
-    if output.absolute() == source.absolute():
-        raise ValueError(f"{source} would be replaced by its own observables: choose another output")
+    check_output(output, source)
+    if plots is not None:
+        make_folder(plots)  # before anything is computed
     notices: list[str] = []
     if written:
         if stored_tension or bins != BINS:
@@ -140,26 +142,22 @@ def observe_file(
     else:
         trajectory = read_trajectory(source)
         problem = problem_of(trajectory, folder)
-        if trajectory.t[-1] < problem.horizon * (1 - 1e-9):
-            notices.append(
-                f"the run has not come to its horizon: its {len(trajectory)} frames to t = {trajectory.t[-1]:.6g} of {problem.horizon:.6g} "
-                "are observed"
-            )
+        notices += filter(None, [unfinished(trajectory, problem)])
         known(names if names is not None else QUANTITIES)
-        for place in (output.parent, plots or output.parent):
-            make_folder(place)  # before anything is computed
         partial = output.with_name(output.name + ".partial.h5")
         rows = observe(
             trajectory, problem, names, stored_tension=stored_tension, every=every, bins=bins, partial=partial, progress=progress
         )
-    make_folder(output.parent)
     files = write_observations(output, rows)
     if not written:
         remove(partial)
     if plots is not None:
         from biem.run.observe_plots import draw_observables  # matplotlib loads slowly: only where it is needed
 
-        files += draw_observables(rows, plots)
+        drawn = draw_observables(rows, plots)
+        files += drawn
+        if not drawn:
+            notices.append(f"there is nothing to draw of {len(rows)} row(s): pictures take more than one, or a quantity in bins")
     report = {
         "source": str(source),
         "files": [str(file) for file in files],
@@ -184,6 +182,9 @@ def problem_of(trajectory: Trajectory, folder: Path) -> Problem:
     """The problem that a trajectory is of, from its first frame on. folder: where its scene's own files are (custom flows, walls)."""
     if len(trajectory) == 0:
         raise ValueError("the trajectory has no frames")
+    if not folder.is_dir():
+        raise ValueError(f"--folder {folder} does not exist: it is where the scene's custom flow or walls are")
+    check_finite(trajectory)
     scene = make_scene(json.loads(trajectory.attributes["scene"]), folder)
     try:
         return build(scene, trajectory.X[0])

@@ -18,6 +18,7 @@ from matplotlib.patches import Rectangle
 from biem.backend import to_numpy
 from biem.curves.curve import centroid, effective_radius
 from biem.curves.fourier import resample
+from biem.run.derived import check_finite
 from biem.run.files import make_folder
 from biem.run.trajectory import MONITORED, Trajectory
 
@@ -29,9 +30,10 @@ LEAST_CORNERS = 128
 
 
 def draw_all(trajectory: Trajectory, folder: Path, movie: bool = True, progress: Callable[[Any], Any] = iter) -> list[Path]:
-    """All pictures that this trajectory has, as files in `folder`; returns their paths. Raises ValueError for an empty one."""
+    """All pictures that this trajectory has, as files in `folder`; returns their paths. Raises ValueError for an empty or damaged one."""
     if len(trajectory) == 0:
         raise ValueError("the trajectory has no frames: there is nothing to draw")
+    check_finite(trajectory)
     make_folder(folder)
     time, unit = _times(trajectory)
     files = [_snapshots(trajectory, time, unit, folder / "frames.png"), _history(trajectory, time, unit, folder / "energy.png")]

@@ -162,4 +162,6 @@ def _read(path: Path) -> Trajectory:
     except OSError as error:
         if not path.exists():
             raise FileNotFoundError(f"trajectory {path} does not exist") from None
+        if path.is_dir():
+            raise ValueError(f"{path} is a folder: give the trajectory, a file NAME.h5") from None
         raise ValueError(f"{path} cannot be read as HDF5: {one_line(error)}") from None

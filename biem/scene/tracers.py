@@ -46,6 +46,9 @@ def points_from_file(path: Path, name: str, where: str = "") -> np.ndarray:
     except ValueError as error:
         said = " ".join(str(error).partition(";")[0].rstrip(".").split())
         raise ValueError(f"{name} {path}: {said}; {expected}") from None
-    if x.shape[1] != 2 or not len(x) or not np.isfinite(x).all():
+    if x.shape[1] != 2 or not len(x):
         raise ValueError(f"{name} {path}: {len(x)} rows of {x.shape[1]} columns; {expected}")
+    wrong = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    if len(wrong):
+        raise ValueError(f"{name} {path}: row {wrong[0] + 1} is {' '.join(map(str, x[wrong[0]]))}; {expected}")
     return x

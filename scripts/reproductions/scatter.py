@@ -22,7 +22,7 @@ from reproductions.taylor_green import ADAPTIVE, EARLY, EVERY, PLAIN, centroids,
 
 NAME = "scatter"
 RUNG = "split[vesicles.points=32,time.adaptive=true]"
-SIZES, COPIES = (1e-2, 1e-3, 1e-6), 4  # of the centroids' shifts, in R
+SIZES, COPIES = (1e-2, 1e-3, 1e-6), 3  # of the centroids' shifts, in R
 TIMES = (5.0, 10.0, 15.0, 20.0)  # t_gamma, in the table
 SMALL, LARGE = 3.0, 0.3  # multiples of the shift, and R, between which its growth is fitted
 

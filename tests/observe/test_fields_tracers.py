@@ -205,6 +205,7 @@ BAD = {
     "both": ({"count": 3, "file": "points.txt"}, "one of them"),
     "no file": ({"file": "none.txt"}, "none.txt does not exist"),
     "no numbers": ({"file": "words.txt"}, "expected rows of two finite numbers"),
+    "not finite": ({"file": "nan.txt"}, "nan.txt: row 2 is 0.5 nan; expected rows of two finite numbers"),
     "three columns": ({"file": "three.txt"}, "1 rows of 3 columns"),
     "nothing in it": ({"file": "empty.txt"}, "0 rows of 2 columns"),
     "beyond memory": ({"count": 10**12}, "and tracers needs about"),
@@ -221,6 +222,7 @@ def test_a_table_that_lacks_something_ends_in_one_line(tmp_path, case, monkeypat
     monkeypatch.setattr("biem.observe.tracers.MOST_DRAWS", 5)
     np.savetxt(tmp_path / "points.txt", [[0.0, 0.0]])
     np.savetxt(tmp_path / "three.txt", [[0.0, 0.0, 1.0]])
+    np.savetxt(tmp_path / "nan.txt", [[0.0, 0.0], [0.5, np.nan]])
     (tmp_path / "words.txt").write_text("here and there\n")
     (tmp_path / "empty.txt").write_text("# x y\n\n")
     changes, fragment = BAD[case]

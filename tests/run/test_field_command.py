@@ -10,7 +10,8 @@ from biem.observe.fields import QUANTITIES, FlowField
 from biem.observe.grid import Grid, box_around, frames_named, grid_shape
 from biem.observe.instant import instant
 from biem.run import fields as sampling
-from biem.run.field_pictures import SHOWN
+from biem.run.field_pictures import SHOWN, Painter
+from biem.run.fields import FrameFields
 from biem.run.simulate import simulate
 from biem.run.trajectory import read_trajectory
 from biem.scene.build import build
@@ -43,7 +44,9 @@ def test_numbers_on_a_grid_are_those_of_the_field(tmp_path, out):
                 stored = file[name][k]
                 assert stored.shape[:2] == (7, 9)
                 assert np.array_equal(stored.reshape(63, *stored.shape[2:]), getattr(exact, name))
-        assert "limits from outside" in file.attrs["about"]
+        assert "of the fluid outside" in file.attrs["about"]
+        assert file["vorticity"].attrs["unit"] == "1/time"
+        assert all(values.attrs["definition"] for values in file.values())
         assert file.attrs["trajectory"] == "out.h5"
     assert not (tmp_path / "f.h5.parts").exists()
 
@@ -53,8 +56,10 @@ def test_a_table_at_points_and_the_disturbance(tmp_path, out):
     arguments = ["--points", tmp_path / "p.txt", "--quantities", "velocity,stress"]
     assert cli("field", out, "-o", tmp_path / "f.csv", *arguments, "--frames", "0:2", "--disturbance").exit_code == 0
     lines = (tmp_path / "f.csv").read_text().splitlines()
-    assert lines[1] == "t,x,y,inside,u,v,s_xx,s_xy,s_yx,s_yy"
-    rows = np.array([[float(value) for value in line.split(",")] for line in lines[2:]])
+    assert lines[4].startswith("# s_xx, s_xy, s_yx, s_yy [kappa_b/length^3]: s = -p I + mu")
+    assert [line[0] for line in lines[:7]] == ["#"] * 6 + ["t"]
+    assert lines[6] == "t,x,y,inside,u,v,s_xx,s_xy,s_yx,s_yy"
+    rows = np.array([[float(value) for value in line.split(",")] for line in lines[7:]])
     assert rows[:, 3].tolist() == [-1, 1, -1, 1]
     exact = of_frame(out, 1, np.array([[0.0, 0.3], [0.35, 0.0]]), disturbance=True)
     assert np.array_equal(rows[2:, 4:6], exact.velocity)
@@ -73,6 +78,18 @@ def test_a_picture_of_each_quantity(tmp_path, out, show):
     picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).reshape(-1, 3)
     assert len(np.unique(picture, axis=0)) > 300
     assert (np.abs(picture.astype(int) - [255, 127, 14]).sum(-1) < 30).any()  # tracers
+
+
+def test_pictures_show_values_where_their_points_are(out):
+    grid = Grid.of((-1.0, -0.5, 1.0, 0.5), (5, 3))
+    trajectory = read_trajectory(out)
+    painter = Painter(trajectory, "vorticity", (-1.0, 1.0), False)
+    figure, axes = painter._figure(grid)
+    painter._draw(figure, axes, FrameFields(0, 0.0, {"vorticity": np.arange(15.0)}), grid, False)
+    x0, x1, y0, y1 = axes.images[0].get_extent()
+    assert np.allclose(x0 + (np.arange(5) + 0.5) * (x1 - x0) / 5, grid.x)
+    assert np.allclose(y0 + (np.arange(3) + 0.5) * (y1 - y0) / 3, grid.y)
+    assert axes.get_xlim() == (-1.0, 1.0)
 
 
 def test_a_movie_has_all_frames_and_may_follow(tmp_path, out):

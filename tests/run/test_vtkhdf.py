@@ -186,7 +186,7 @@ def test_an_unfinished_run_is_exported_as_far_as_it_is_committed_and_said_so(tmp
     simulate(scene_of(PAIR), tmp_path / "out.h5", force=True, enough=lambda t, X: t >= 1.9 * DT)
     result = cli("export", tmp_path / "out.h5", "--vtkhdf", "--shapes")
     assert result.exit_code == 0
-    assert f"the 3 frames that it has committed, to t = {2 * DT:.6g} of {6 * DT:.6g}" in result.stderr
+    assert f"it has committed 3 frame(s), to t = {2 * DT:.6g} of {6 * DT:.6g}" in result.stderr
     assert len(steps_of(tmp_path / "out.vtkhdf")) == 3
 
 
@@ -198,7 +198,7 @@ def test_loose_frames_of_a_run_that_is_being_written_are_exported_too(tmp_path):
         writer.append(one_frame(run.t[k], run.step[k], run.X[k], run.sigma[k], diagnostics))
     assert (tmp_path / "out.h5.frames").is_dir()
     result = cli("export", tmp_path / "out.h5", "--vtkhdf", "--shapes")
-    assert "the 3 frames that it has committed" in result.stderr
+    assert "it has committed 3 frame(s)" in result.stderr
     assert [t for t, _ in steps_of(tmp_path / "out.vtkhdf")] == run.t[:3].tolist()
 
 
