@@ -17,6 +17,7 @@ Kind = Literal["quiescent", "shear", "extensional", "poiseuille", "taylor_green"
 MapKind = Literal["ivnet", "mlp", "hybrid", "exact"]
 MAP_KINDS = '"ivnet", "mlp", "hybrid" or "exact"'
 TIMES = 'a positive, finite number or a number and a unit, as in "0.01 t_gamma"'
+MOST_CONTRAST = 1e5  # a vesicle is as good as rigid at 1e4; at 1e6 the equations have lost their digits
 EXPECTED = {  # for keys whose types or patterns say it badly
     "solver.device": '"cpu" (NumPy), "torch" (PyTorch on the CPU), "cuda" or "cuda:N"',
     **{f"solver.maps.{slot}": MAP_KINDS for slot in SLOTS},
@@ -25,7 +26,7 @@ EXPECTED = {  # for keys whose types or patterns say it badly
     "time.dt": TIMES,
     "time.horizon": TIMES,
     "time.dt_min": TIMES,
-    "vesicles.contrast": "a positive, finite number (viscosity inside over outside), or a list of one for each vesicle",
+    "vesicles.contrast": f"a positive number up to {MOST_CONTRAST:.0e} (viscosity inside over outside), or a list of one for each vesicle",
 }
 LATER = ("domain", "observe", "tracers")  # optional tables of a scene that are left out of its resolved form
 FLOAT32_TOLERANCE = 1e-5  # the least that sums in float32 can be asked for
@@ -63,7 +64,7 @@ class Vesicles(Table):
     @classmethod
     def _positive(cls, contrast: Any) -> Any:
         values = contrast if isinstance(contrast, list) and contrast else [contrast]
-        if not all(isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.inf for value in values):
+        if not all(isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= MOST_CONTRAST for value in values):
             raise ValueError("not positive")  # said in words by EXPECTED
         return contrast
 

@@ -31,7 +31,7 @@ REFUSED = {
     "vesicles.box": "[1.0] | [1.0, inf]",
     "vesicles.corner": "[0.0]",
     "vesicles.gap": "-0.1 | nan",
-    "vesicles.contrast": '0 | -2 | [1.0, 0.0] | [] | true | "a" | inf',
+    "vesicles.contrast": '0 | -2 | [1.0, 0.0] | [] | true | "a" | inf | 2e5',
     "flow.kind": '"sheer"',
     "flow.rate": '"fast" | nan',
     "flow.u_max": "inf",
