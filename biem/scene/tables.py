@@ -82,6 +82,8 @@ def _explain(error: Any, root: type[Table], expected: Mapping[str, str]) -> str:
         near = difflib.get_close_matches(str(error["loc"][-1]), known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else "the keys there are " + ", ".join(known)
         return f"unknown key {path}: {hint}"
+    if error["type"] == "missing" and isinstance(error["loc"][-1], int):  # of a pair
+        return f"{path.rpartition('.')[0]} = {error['input']!r}: expected two numbers"
     if error["type"] == "missing":
         return f"key {path} is missing"
     for key, what in expected.items():

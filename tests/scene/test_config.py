@@ -186,6 +186,12 @@ def test_missing_key_is_named(missing):
         scene_of(time={missing.split(".")[1]: None})
 
 
+def test_pairs_of_other_than_two_numbers_are_shown():
+    for name in ("box", "corner"):
+        with pytest.raises(ValueError, match=rf"vesicles\.{name} = \[1\.0\]: expected two numbers"):
+            scene_of(vesicles={name: [1.0]})
+
+
 def test_missing_table_is_named():
     with pytest.raises(ValueError, match=r"time.* missing"):
         make_scene({"name": "no_time"})
