@@ -93,6 +93,14 @@ def test_rest_position_and_residual_velocity():
     assert found["residual"] == pytest.approx(1e-3 / 0.5, rel=1e-4)
 
 
+def test_how_fast_a_run_comes_to_the_centre_line():
+    scene, t = rung(study.SCENES / "poiseuille_single.toml", "split").scene, np.arange(61.0)
+    path = lambda y: trajectory(scene, np.stack([t, 0.5 * y], axis=-1)[:, None], t, unit=2e-4, width=0.5)
+    assert poiseuille.approach(path(0.02 * np.exp(-t / 40.0))) == pytest.approx(40.0, rel=1e-6)
+    assert poiseuille.approach(path(0.05 + 0.02 * np.exp(-t / 40.0))) is None
+    assert poiseuille.approach(path(0.001 * np.exp(t / 40.0))) is None
+
+
 @pytest.mark.parametrize(("ca", "order"), [(10, 2), (20, 2), (30, 1), (50, 1)])
 def test_networks_get_steps_that_they_know_and_that_are_short(ca, order):
     scene = poiseuille.scene("vesnet:hybrid", 0.4, ca).scene
