@@ -224,8 +224,8 @@ def section(results: Results) -> str:
     slow = [r["approach"] for r in rows if r.get("approach")]
     if slow:
         lines.append(
-            f"Near the centre line the reference's y falls by e in {min(slow):.0f} to {max(slow):.0f} t_gamma, where it does: an error of the "
-            "lateral velocity of y over that time is enough to make the centre unstable, and a rung then rests beside it."
+            f"Near the centre line the reference's y falls by e in {min(slow):.0f} to {max(slow):.0f} t_gamma, where it does: an error "
+            "of the lateral velocity of y over that time is enough to make the centre unstable, and a rung then rests beside it."
         )
     residual = []
     for name in names:
