@@ -163,10 +163,11 @@ def _evolution(curves: Results, path: Path) -> str:
     made, axes = figure(7.0, 4.0)
     panel = axes[0, 0]
     for name, found in curves.items():
-        p = {q: _plotted(v) for q, v in found["percentiles"].items()}
-        panel.plot(p["50"], color=_color(name), label=name)
+        p = {q: _plotted(v)[1:] for q, v in found["percentiles"].items()}
+        steps = range(1, 1 + len(p["50"]))
+        panel.plot(steps, p["50"], color=_color(name), label=name)
         for low, high, alpha in (("5", "95", 0.1), ("25", "75", 0.2)):
-            panel.fill_between(range(len(p["50"])), p[low], p[high], color=_color(name), alpha=alpha, linewidth=0)
+            panel.fill_between(steps, p[low], p[high], color=_color(name), alpha=alpha, linewidth=0)
     panel.set(yscale="log", xlabel=f"relaxation steps of {DT:g}", ylabel="relative L2 error of X", title="median, 25-75 %, 5-95 %")
     panel.grid(alpha=0.3)
     panel.legend(fontsize=8)
@@ -177,10 +178,10 @@ def _examples(states: dict[str, np.ndarray], wanted: np.ndarray, curves: Results
     made, axes = figure(12.0, 6.4, len(names), 3)
     for k, (row, title) in enumerate(zip(axes, names, strict=True)):
         for name, found in curves.items():
-            row[0].semilogy(
-                range(1, len(found["examples"][title]["shape"])), _plotted(found["examples"][title]["displacement"]), color=_color(name)
-            )
-            row[1].semilogy(_plotted(found["examples"][title]["shape"]), color=_color(name), label=name)
+            off = _plotted(found["examples"][title]["displacement"])
+            steps = range(1, 1 + len(off))
+            row[0].semilogy(steps, off, color=_color(name))
+            row[1].semilogy(steps, _plotted(found["examples"][title]["shape"])[1:], color=_color(name), label=name)
         row[0].set(ylabel=f"{title}\nerror of the displacement", xlabel="steps")
         row[1].set(ylabel="error of the shape", xlabel="steps")
         row[1].legend(fontsize=7)
@@ -190,7 +191,7 @@ def _examples(states: dict[str, np.ndarray], wanted: np.ndarray, curves: Results
             if np.isfinite(X[samples + k]).all():
                 row[2].plot(*outlines(X[samples + k][None])[0], color=shade, lw=lw, label=name)
         row[2].set(aspect="equal", title=f"after {len(wanted) - 1} steps")
-        row[2].legend(fontsize=6)
+        row[2].legend(fontsize=6, loc="center left", bbox_to_anchor=(1.0, 0.5))
         for panel in row[:2]:
             panel.grid(alpha=0.3)
     return save(made, folder / "examples.png")
