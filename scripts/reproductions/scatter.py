@@ -7,6 +7,7 @@ are those of errors that solvers make in the first t_gamma: 1e-2 R by `balanced`
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -80,6 +81,10 @@ def tenfold(t: np.ndarray, apart: np.ndarray) -> float:
     return float(1.0 / np.polyfit(t[use], np.log10(apart[use]), 1)[0])
 
 
+def _range(values: list[Any]) -> str:
+    return " to ".join(f"{v:g}" for v in dict.fromkeys((min(values), max(values)))) if values else ""
+
+
 def _picture(rows: list[Results], path: Path) -> str:
     made, axes = figure(10.0, 3.8, 1, 2)
     shades = dict(zip(sorted({row["size"] for row in rows}, reverse=True), ("tab:red", "tab:orange", "tab:blue", "black"), strict=False))
@@ -113,14 +118,14 @@ def section(results: Results) -> str:
         spread = []
         for time in TIMES:
             counts = [row["left"][k] for row in mine if (k := round(time / EVERY)) < len(row["left"])]
-            spread.append(f"{min(counts)} to {max(counts)}" if counts else "")
+            spread.append(_range(counts))
         apart = [u for u in until if u is not None]
         lines.append(
             [
                 f"{size:g}",
                 len(mine),
                 float(np.nanmedian(grow)) if np.isfinite(grow).any() else None,
-                f"{min(apart):g} to {max(apart):g}" if apart else "never",
+                _range(apart) or "never",
                 *spread,
                 " ".join(map(str, off)),
             ]
@@ -137,6 +142,6 @@ def section(results: Results) -> str:
             table([*head, f"largest differences up to {EARLY:g}"], lines),
             "Times in t_gamma; the last column has a number for each copy. An error grows as a shift does, whatever makes it: a solver "
             "that is to have the reference's count within one vesicle at every time must err by less, from the start, than the shift "
-            "for which the copies do.",
+            "for which the copies do. No solver on 32 nodes does, and no reference above does either.",
         ]
     )
