@@ -18,7 +18,7 @@ from biem.run.files import atomic_h5
 from biem.run.trajectory import Trajectory
 from biem.scene.build import build
 from reproductions.pictures import figure, label, save
-from reproductions.study import SCENES, Results, Study, Task, from_file, gather, scene_rung, table, write_results
+from reproductions.study import REJECTED, SCENES, Results, Study, Task, from_file, gather, scene_rung, table, write_results
 from reproductions.taylor_green import ADAPTIVE, EARLY, EVERY, PLAIN, centroids, left
 
 NAME = "scatter"
@@ -79,6 +79,17 @@ def tenfold(t: np.ndarray, apart: np.ndarray) -> float:
     if use.sum() < 3:
         return float("nan")
     return float(1.0 / np.polyfit(t[use], np.log10(apart[use]), 1)[0])
+
+
+def _stopped(rows: list[Results]) -> list[str]:
+    """That some were rejected, in words."""
+    times = [row["until"] for row in rows if row["state"] == REJECTED]
+    if not times:
+        return []
+    return [
+        f"{len(times)} of the {len(rows)} copies were rejected, at {_range(times)} t_gamma, and count up to there: without a repulsion two "
+        "vesicles are pressed through each other, which 32 nodes do not keep apart."
+    ]
 
 
 def _range(values: list[Any]) -> str:
@@ -143,5 +154,6 @@ def section(results: Results) -> str:
             "Times in t_gamma; the last column has a number for each copy. An error grows as a shift does, whatever makes it: a solver "
             "that is to have the reference's count within one vesicle at every time must err by less, from the start, than the shift "
             "for which the copies do. No solver on 32 nodes does, and no reference above does either.",
+            *_stopped(copies),
         ]
     )
