@@ -102,12 +102,12 @@ def _steps(steps: Sequence[Measured]) -> list[str]:
         last = max(m.tried, key=lambda step: step.dt)
         why = "none did" if last.stable else _short(last.line)
         rows.append([f"{m.ladder.capillary:g}", f"{m.ladder.points}", m.ladder.rung, _number(m.stable), _number(m.accurate), why])
+    bounded = sum("solver.max_error" in max(m.tried, key=lambda step: step.dt).line for m in steps)
     text = (
         f"Two vesicles in shear: dt was doubled until a run to {HORIZON:g} t_gamma, of {LEAST_STEPS} steps at least, broke; its positions "
-        f"and shapes are held against steps of second order of 0.005 t_gamma at as many nodes. "
-        f"{sum('solver.max_error' in max(m.tried, key=lambda step: step.dt).line for m in steps)} of the {len(steps)} ladders end where a step "
-        "errs by more in area or length than the run allows, solver.max_error, before it is corrected: a bound that a scene may raise. Steps of "
-        "networks are multiples of 1e-5 mu L^3/kappa_b, which at Ca = 50 is 0.24 t_gamma."
+        f"and shapes are held against steps of second order of 0.005 t_gamma at as many nodes. {bounded} of the {len(steps)} ladders end "
+        "where a step, before it is corrected, errs by more in area or length than the run allows (solver.max_error): a bound that a scene "
+        "may raise. Steps of networks are multiples of 1e-5 mu L^3/kappa_b, which at Ca = 50 is 0.24 t_gamma."
     )
     return ["## How large steps may be", "", text, "", "![Largest steps](images/extremes_steps.png)", "", *map(_row, rows), ""]
 
