@@ -174,6 +174,8 @@ class _Loop:
                     unit = self.problem.flow.time_scale
                     when = f"t = {self.state.t:.6g}" + (f" ({self.state.t / unit:.4g} t_gamma)" if unit else "")
                     way = "smaller steps (time.dt)" if self.controller is None else "a lower time.dt_min or a larger time.tolerance"
+                    if self.controller is not None and " cross (" in str(failure):
+                        way = "more nodes (vesicles.points) or solver.repulsion, where steps this small do not keep them apart"
                     if scene.walls is not None and scene.walls.kind == "channel" and "crosses a wall" in str(failure):
                         way += "; at an end of the channel, where the fluid leaves, a longer channel or a shorter time.horizon"
                     raise NumericalFailure(

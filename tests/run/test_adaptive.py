@@ -203,6 +203,7 @@ def test_below_dt_min_the_run_ends_with_the_last_good_state(tmp_path, monkeypatc
     words = {"solver": "GMRES stopped", "flow": "not finite at x = 1", "not finite": "non-finite", "crossing": "vesicles 0 and 1 cross"}
     step, t = int(re.search(r"step (\d+) rejected", message)[1]), float(re.search(r"at t = (\S+) ", message)[1])
     assert words[case] in message
+    assert ("more nodes (vesicles.points) or solver.repulsion" if case == "crossing" else "a lower time.dt_min") in message
     assert f"time.dt_min = {0.001 * T:g}" in message
     assert (kept.step[-1], kept.t[-1]) == (step - 1, pytest.approx(t, rel=1e-5))
     assert 0.1 * T <= kept.t[-1] < 0.14 * T
