@@ -88,10 +88,10 @@ FAILURES = {
     "nothing to resume": (["run", "{scene}", "-o", "{tmp}/x.h5", "--resume"], "no readable checkpoint"),
     "no trajectory to plot": (["plot", "{tmp}/none.h5"], "none.h5"),
     "plot a scene": (["plot", "{scene}"], "scene.toml"),
-    "plot a folder": (["plot", "{tmp}"], "HDF5"),
+    "plot a folder": (["plot", "{tmp}"], "is a folder: give the trajectory"),
     "no trajectory to verify": (["verify", "{tmp}/none.h5"], "none.h5"),
     "verify a scene": (["verify", "{scene}"], "scene.toml"),
-    "verify a folder": (["verify", "{tmp}"], "HDF5"),
+    "verify a folder": (["verify", "{tmp}"], "is a folder: give the trajectory"),
     "too many steps": (["run", "{scene}", "-o", "{tmp}/x.h5", "--set", "time.dt=1e-14"], "free"),
 }
 
