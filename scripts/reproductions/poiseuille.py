@@ -25,6 +25,7 @@ from biem.curves.fourier import resample
 from biem.curves.reparam import redistribute
 from biem.run.files import atomic_h5
 from biem.run.trajectory import Trajectory
+from reproductions.lateral import in_words, lateral_velocities
 from reproductions.pictures import color, figure, fill, label, save
 from reproductions.study import (
     FINISHED,
@@ -51,6 +52,7 @@ POINTS = 32  # of those that start at the reference's end
 CN, CA = (0.75, 0.6, 0.4, 0.2), (10, 20, 30, 40, 50)
 R = sqrt(0.65) / (2.0 * pi)  # of a membrane of length 1 and reduced area 0.65
 LEARNED, LONGEST = 1e-5, 0.1  # a step of the networks, mu L^3/kappa_b; a step of order 2, t_gamma, at most
+MEASURED = ((0.75, 20), (0.75, 40))  # cases whose lateral velocities are measured
 HORIZON, FROM_REST = 1200, 200  # t_gamma: of runs, and of those that start where the reference came to rest
 AT_REST = 5.0  # t_gamma at the end over which velocities are taken
 START, BAR = 0.5, 0.01  # of y/W
@@ -103,22 +105,31 @@ def measure(study: Study) -> Results:
         other = expected[row["cn"], row["ca"]]
         if row["state"] == other["state"] == FINISHED:
             row["off"] = abs(abs(row["y"]) - abs(other["y"]))
+    velocities = {
+        f"Cn {cn}, Ca {ca}": lateral_velocities(trajectory, at_few_nodes)
+        for cn, ca in MEASURED
+        if (cn, ca) in starts and (trajectory := runs[f"{REFERENCE} {cn} {ca}"].trajectory) is not None
+    }
     pictures = [_lateral(rows, names, folder / "lateral.png")]
     shapes = {
         name: [(cn, ca, runs[f"{name} {cn} {ca}"], row) for row in rows for cn, ca in [(row["cn"], row["ca"])] if row["rung"] == name]
         for name in (REFERENCE, NETWORK)
     }
     pictures.append(_phases(shapes, folder / "phases.png"))
-    return write_results(study, NAME, {"rungs": list(names), "rows": rows, "pictures": pictures})
+    return write_results(study, NAME, {"rungs": list(names), "rows": rows, "velocities": velocities, "pictures": pictures})
 
 
 def start_file(X: np.ndarray, path: Path) -> Path:
-    """The shape X (1, 2, N) at POINTS nodes, equally spaced, of the same area and length, in a file for `vesicles.file`."""
-    few, _ = restore_area_length(redistribute(resample(X, POINTS))[0], area(X), length(X))
+    """The shape X (1, 2, N) `at_few_nodes` in a file for `vesicles.file`."""
     path.parent.mkdir(exist_ok=True)
     with atomic_h5(path) as file:
-        file["X"] = few
+        file["X"] = at_few_nodes(X)
     return path
+
+
+def at_few_nodes(X: np.ndarray) -> np.ndarray:
+    """X (1, 2, N) at POINTS nodes, equally spaced, of the same area and length."""
+    return restore_area_length(redistribute(resample(X, POINTS))[0], area(X), length(X))[0]
 
 
 def at_rest(trajectory: Trajectory) -> Results:
@@ -227,6 +238,8 @@ def section(results: Results) -> str:
             f"Near the centre line the reference's y falls by e in {min(slow):.0f} to {max(slow):.0f} t_gamma, where it does: an error "
             "of the lateral velocity of y over that time is enough to make the centre unstable, and a rung then rests beside it."
         )
+    if any(results["velocities"].values()):
+        lines.append(in_words(results["velocities"]))
     residual = []
     for name in names:
         values = [r["residual"] for r in done[name] if r["at_rest"]]

@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers import reflect
 from reproduce import app, report
-from reproductions import near, poiseuille, scatter, shear, study, taylor_green
+from reproductions import lateral, near, poiseuille, scatter, shear, study, taylor_green
 from studies.rungs import rung
 from typer.testing import CliRunner
 
 from biem.curves.curve import area, centroid, length
-from biem.curves.shapes import equilibrium, place
+from biem.curves.shapes import equilibrium, perturbed, place
+from biem.membrane.maps import ExactMaps
 from biem.run.trajectory import Trajectory, TrajectoryWriter
 from biem.scene.build import build
 
@@ -99,6 +101,14 @@ def test_how_fast_a_run_comes_to_the_centre_line():
     assert poiseuille.approach(path(0.02 * np.exp(-t / 40.0))) == pytest.approx(40.0, rel=1e-6)
     assert poiseuille.approach(path(0.05 + 0.02 * np.exp(-t / 40.0))) is None
     assert poiseuille.approach(path(0.001 * np.exp(t / 40.0))) is None
+
+
+def test_lateral_velocities_need_nodes_and_change_sign_in_a_mirror():
+    X = place(perturbed(128, 0.65, modes=3, seed=1), (0.0, 0.01), 0.4)[None]
+    true = lateral._across(ExactMaps(points=256), X, 0.5, 2e-4, 4)
+    assert abs(true) > 1e-4
+    assert lateral._across(ExactMaps(points=128), X, 0.5, 2e-4, 4) == pytest.approx(true, abs=1e-6)
+    assert lateral._across(ExactMaps(points=256), reflect(X), 0.5, 2e-4, 4) == pytest.approx(-true, abs=1e-8)
 
 
 @pytest.mark.parametrize(("ca", "order"), [(10, 2), (20, 2), (30, 1), (50, 1)])
