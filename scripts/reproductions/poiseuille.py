@@ -259,7 +259,7 @@ def section(results: Results) -> str:
             f"{LONGEST} t_gamma; operators at N = 32 are built at 64 nodes, and networks are trained on the converged flow. "
             f"{' and '.join(map(label, FROM_START))} start at W/2, the others at the reference's last frame, for {FROM_REST} t_gamma. "
             f"{label(RELAX)} has exact advection: where it rests as the reference does and hybrid does not, it is the learned advection "
-            "that moves hybrid. The paper's VesNet at N = 128 has no counterpart: the shipped networks are for 32 nodes. The flow is unbounded, W is only "
-            "the width of the parabola, as in the paper.",
+            "that moves hybrid. The paper's VesNet at N = 128 has no counterpart: the shipped networks are for 32 nodes. The flow is "
+            "unbounded, W is only the width of the parabola, as in the paper.",
         ]
     )
