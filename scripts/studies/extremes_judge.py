@@ -107,7 +107,7 @@ def settle(case: Case, folder: Path, again: bool = False) -> Outcome:
     for how, scene in _ways(case):
         run = path.with_name(f"{path.stem}-{_file_name(how)}.h5")
         attempt, last = _attempt(how, scene, run, folder, case.bound)
-        attempts.append(attempt)
+        attempts.append(replace(attempt, line=_said_anywhere(attempt.line, folder)))
         if attempt.problems or attempt.code == 0 or (how == "as given" and attempt.code == BAD_INPUT):
             break
         if how == "adaptive" and attempt.code == REJECTED:
@@ -179,8 +179,6 @@ def _outcome(case: Case, attempts: list[Attempt], last: Kept | None, folder: Pat
     finished = final.code == 0 and not final.problems
     outcome = ILL if problems else (FINISHED if len(attempts) == 1 else SMALLER) if finished else REFUSED
     line = "" if outcome == FINISHED else first.line if len(attempts) == 1 or outcome == SMALLER else _last_rejection(attempts)
-    for where in (folder.resolve(), ROOT):  # the same line wherever it was said
-        line = line.replace(f"{where}/", "")
     base = Outcome(case.axis, case.value, case.rung, outcome, final.how if finished else first.how, line, problems, attempts)
     if last is None:
         return base
@@ -210,6 +208,13 @@ def _outcome(case: Case, attempts: list[Attempt], last: Kept | None, folder: Pat
         first_step=float(case.scene["time"]["dt"]),
         rejected=float(d["rejected"].sum()),
     )
+
+
+def _said_anywhere(line: str, folder: Path) -> str:
+    """The line without the folders of this machine."""
+    for where in (folder.resolve(), ROOT):
+        line = line.replace(f"{where}/", "")
+    return line
 
 
 def _last_rejection(attempts: list[Attempt]) -> str:
