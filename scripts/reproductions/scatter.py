@@ -1,7 +1,7 @@
 """How far the number of vesicles left in a Taylor-Green cell is determined: copies of one run whose vesicles begin a little aside.
 
-In a copy every centroid is moved by SIZE R in a direction drawn by chance; all else, the solver and its steps too, is as in the run. Sizes
-are those of errors that solvers make in the first t_gamma: 1e-2 R by `balanced`, 1e-3 R by 32 nodes; and one far below.
+In a copy every centroid is moved by SIZE R in a direction drawn by chance; all else, the solver and its steps too, is as in the run. Sizes:
+1e-2 R, by which `balanced` errs in the first t_gamma (docs/trade.md), a tenth of it, and one far below what any rung reaches.
 """
 
 from __future__ import annotations
