@@ -40,6 +40,9 @@ def test_a_run_is_not_replaced_by_its_observables(tmp_path, run):
     assert cli("observe", run, "-o", tmp_path / "o.h5").exit_code == 0
     assert "is a trajectory, which is not replaced" in the_error(cli("observe", tmp_path / "o.h5", "-o", run), 2)
     assert cli("observe", run, "-o", tmp_path / "o.h5").exit_code == 0  # what it has made itself is made anew
+    (tmp_path / "folder").mkdir()
+    message = the_error(cli("observe", tmp_path / "o.h5", "-o", tmp_path / "folder" / ".." / "o.h5", "--quantities", "area"), 2)
+    assert "is the file that it is made of" in message
 
 
 @pytest.mark.parametrize("command", MAKERS)
