@@ -46,7 +46,7 @@ def check_finite(trajectory: Trajectory) -> None:
 
 
 def unfinished(trajectory: Trajectory, problem: Problem) -> str | None:
-    """What is to be said of a run that has not come to its horizon, up to a colon."""
+    """What is to be said of a run that has not come to its horizon; None of one that has."""
     if trajectory.t[-1] >= problem.horizon * (1 - 1e-9):
         return None
     return (
