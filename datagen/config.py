@@ -74,7 +74,7 @@ class Select(Table):
 
 
 class Label(Table):
-    """Training pairs. points: nodes N of the network's curves; operators are built at operator_points and read back at N.
+    """Training pairs. points: nodes N of the network's curves; operators are built at operator_points, their results low-passed to N.
 
     relaxation: "implicit" is one semi-implicit step of dt, "converged" the flow over dt, by `substeps` steps, extrapolated. modes:
     default all, 0..N/2. chunk: shapes of one task.

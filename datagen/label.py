@@ -3,7 +3,7 @@
 Shapes X (n, 2, n_op) in the units mu = kappa_b = length = 1; the maps are those of `biem.ExactMaps(points=n_op)` for the n_op-node curve,
 for a whole basis at once. The basis is e_{k,re} = cos(k alpha), e_{k,im} = sin(k alpha), k = 0..N/2, in the directions x and y, as N nodes
 hold it: the im part of k = 0 and of k = N/2 is zero, and so are its labels. Axes after the shape: part (re, im) and direction of the input,
-direction of the output, node. float32; velocities and tensions are read at the N nodes, shapes are low-passed to N nodes (`resample`).
+direction of the output, node. float32; shapes, velocities and tensions are low-passed to N nodes (`resample`).
 
     X_std           (n, 2, N)           X
     relax           (n, 2, N)           X_next - X after dt: the increment, of which X_next in float32 would keep but three or four digits
@@ -134,9 +134,9 @@ def basis_functions(N: int, n: int, modes: tuple[int, ...]) -> np.ndarray:
     return resample(np.array(parts).reshape(-1, N), n)
 
 
-def _rows(K: np.ndarray, N: int) -> np.ndarray:
-    """K (m, 3, n, n), which is symmetric, towards the N nodes (m, 3, N, n)."""
-    return np.ascontiguousarray(read_back(K, N).swapaxes(-1, -2))
+def _rows(K: np.ndarray, N: int, bring: Callable[[np.ndarray, int], np.ndarray]) -> np.ndarray:
+    """K (m, 3, n, n), which is symmetric, with its values brought to N nodes by `resample` or `read_back` (m, 3, N, n)."""
+    return np.ascontiguousarray(bring(K, N).swapaxes(-1, -2))
 
 
 def _relax(few: _Few, label: Label) -> Labels:
@@ -158,22 +158,22 @@ def _flow(X: np.ndarray, dt: float, steps: int) -> np.ndarray:
 
 def _self_tension(few: _Few, label: Label) -> Labels:
     rates = few.maps.rate(few.maps.velocity(few.maps.bending))
-    return {"self_tension": read_back(few.maps.tensions(rates[..., None], few.strain_matrices[1])[..., 0], few.N)}
+    return {"self_tension": resample(few.maps.tensions(rates[..., None], few.strain_matrices[1])[..., 0], few.N)}
 
 
 def _flow_tension(few: _Few, label: Label) -> Labels:
-    return few.by_mode("flow_tension", read_back(few.tensions.transpose(0, 3, 2, 1), few.N))
+    return few.by_mode("flow_tension", resample(few.tensions.transpose(0, 3, 2, 1), few.N))
 
 
 def _advection(few: _Few, label: Label) -> Labels:
     """e - h K D (sigma t)."""
     m, _, n = few.X.shape
     t = few.maps.t[:, :, None, :]
-    rows = np.matmul(_rows(few.K, few.N), few.maps.h * constant(differentiation_matrix, n, like=few.X))
+    rows = np.matmul(_rows(few.K, few.N, resample), few.maps.h * constant(differentiation_matrix, n, like=few.X))
     rows = np.concatenate([rows[:, k] * t[:, 0] + rows[:, k + 1] * t[:, 1] for k in (0, 1)], axis=1)  # (m, 2 N, n)
     moved = np.matmul(rows, few.tensions.reshape(m, n, -1)).reshape(m, 2, few.N, 2, -1)
     values = -moved.transpose(0, 4, 3, 1, 2)  # (m, C, direction in, out, N)
-    e = few.basis(few.N)
+    e = resample(few.basis(n), few.N)
     for direction in (0, 1):
         values[:, :, direction, direction] += e
     return few.by_mode("advection", values)
@@ -183,7 +183,7 @@ def _near(few: _Few, label: Label) -> Labels:
     m, _, n = few.X.shape
     fine = Resultants(resample(few.X, 2 * n))  # K times the speed has twice the modes of X
     force = few.basis(2 * n) * (fine.h * fine.speed)[:, None, :]
-    on_curve = np.matmul(_rows(fine.kernel(), few.N), force.swapaxes(-1, -2)[:, None])
+    on_curve = np.matmul(_rows(fine.kernel(), few.N, read_back), force.swapaxes(-1, -2)[:, None])
     values = np.empty((m, len(LAYERS), *on_curve.shape[1:]))
     values[:, LAYERS.index(0.0)] = on_curve
     off = np.flatnonzero(LAYERS)

@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 
 from biem.backend import constant, one_blas_thread
-from biem.curves.fourier import derivative, differentiation_matrix, read_back, resample
+from biem.curves.fourier import derivative, differentiation_matrix, resample
 from biem.membrane.maps import ExactMaps
 from biem.membrane.resultants import Resultants
 
@@ -41,9 +41,9 @@ def _operators(X: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
     D = constant(differentiation_matrix, n, like=X)
     rows = np.matmul(K[:, [[0, 1], [1, 2]]], maps.h * D)  # (m, out, in, n, n)
     moved = np.matmul(np.einsum("moijk,mik->mojk", rows, maps.t).reshape(m, 2 * n, n), sigma.reshape(m, n, -1))
-    moved = read_back(moved.reshape(m, 2, n, 2, -1).transpose(0, 4, 3, 1, 2), N)  # (m, C, in, out, N)
-    advection = np.eye(2)[:, :, None] * constant(_basis, N, N, like=X)[:, None, None, :] - moved
-    tension = read_back(sigma.transpose(0, 3, 2, 1), N)
+    moved = resample(moved.reshape(m, 2, n, 2, -1).transpose(0, 4, 3, 1, 2), N)  # (m, C, in, out, N)
+    advection = np.eye(2)[:, :, None] * resample(e, N)[:, None, None, :] - moved
+    tension = resample(sigma.transpose(0, 3, 2, 1), N)
     return advection.reshape(m, -1, 2, 2, 2, N), tension.reshape(m, -1, 2, 2, N)
 
 

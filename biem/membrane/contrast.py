@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from biem.backend import Array, Latest, array_namespace, constant, count, from_numpy, parallel_map, shares, solve
-from biem.curves.fourier import read_back_matrix, resample, resampling_matrix
+from biem.curves.fourier import resample, resampling_matrix
 from biem.membrane.maps import ExactMaps, operator_points
 from biem.membrane.operators import VesicleOperators, bending_force, relaxation_system
 from biem.stokes.double_layers import own_matrix
@@ -116,7 +116,6 @@ class ContrastMaps(ExactMaps):
             columns = xp.reshape(ops.bending_velocity(), (ops.X.shape[0], -1, 1))
             return xp.reshape(relaxation_system(ops, columns, dt, False)[0], ops.X.shape)
 
-        # low-passed as in ExactMaps.relax
         return X + resample(xp.concat(self._by_chunk(X, increment), axis=0), X.shape[-1])
 
     def self_tension(self, X: Array) -> Array:
@@ -151,14 +150,14 @@ class ContrastMaps(ExactMaps):
 def _responses_of(ops: ContrastOperators, N: int) -> _Responses:
     xp = array_namespace(ops.X)
     m, _, n = ops.X.shape
-    E, R = constant(resampling_matrix, n, N, like=ops.X), constant(read_back_matrix, N, n, like=ops.X)
-    at_nodes = lambda a: xp.reshape(xp.matmul(R, xp.reshape(a, (m, 2, n, -1))), (m, 2 * N, -1))
+    E, R = constant(resampling_matrix, n, N, like=ops.X), constant(resampling_matrix, N, n, like=ops.X)
+    low_passed = lambda a: xp.reshape(xp.matmul(R, xp.reshape(a, (m, 2, n, -1))), (m, 2 * N, -1))
     outer = by_component(ops.A_inverse, E)
     bending = xp.reshape(ops.bending_velocity(), (m, 2 * n, 1))
     solved = solve(ops.L, ops.divergence(xp.concat([bending, outer], axis=-1)))  # L^-1 P [B X, A^-1 E]
     tension = xp.matmul(R, solved)
-    advection = at_nodes(outer - xp.matmul(ops.T, solved[..., 1:]))
-    return _Responses(tension[..., 0], tension[..., 1:], advection, at_nodes(outer), at_nodes(by_component(ops.S, E)))
+    advection = low_passed(outer - xp.matmul(ops.T, solved[..., 1:]))
+    return _Responses(tension[..., 0], tension[..., 1:], advection, low_passed(outer), low_passed(by_component(ops.S, E)))
 
 
 def _apply(matrix: Array, u: Array) -> Array:

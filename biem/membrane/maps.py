@@ -1,7 +1,8 @@
 """The seam between steppers and membrane physics: `MembraneMaps`, and its exact realisation by dense operators.
 
-All maps are batched over M vesicles in the world frame. `ExactMaps` builds its operators on `points` nodes of the resampled curve
-and reads velocities and tensions back on the N nodes it was given; 2 N removes the aliasing of P and T that dominates at small N.
+All maps are batched over M vesicles in the world frame. `ExactMaps` builds its operators on `points` nodes of the resampled curve and
+low-passes what they give to the N nodes it was given; 2 N removes the aliasing of P and T that dominates at small N. Read at the nodes
+instead, the modes that these cannot hold would alias into the shape, at every step and differently for every place of the nodes.
 Other realisations are made elsewhere, from a `MapsRequest`.
 """
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from biem.backend import Array, Latest, array_namespace
 from biem.curves.curve import length, normal
-from biem.curves.fourier import read_back, resample
+from biem.curves.fourier import resample
 from biem.membrane.resultants import Resultants
 from biem.stokes.near import layer_values
 
@@ -120,19 +121,17 @@ class ExactMaps:
 
     def advect(self, X: Array, u: Array) -> Array:
         maps = self._resultants(X)
-        return read_back(maps.project(resample(u, maps.X.shape[-1])), X.shape[-1])
+        return resample(maps.project(resample(u, maps.X.shape[-1])), X.shape[-1])
 
     def relax(self, X: Array, dt: float) -> Array:
-        # low-passed, not read back at the nodes: the stiff modes that N nodes cannot hold relax at once, whatever dt is, and would
-        # alias into the shape at every step
         return X + resample(self._build(X).relaxation(dt), X.shape[-1])
 
     def self_tension(self, X: Array) -> Array:
-        return read_back(self._resultants(X).self_tension(), X.shape[-1])
+        return resample(self._resultants(X).self_tension(), X.shape[-1])
 
     def flow_tension(self, X: Array, u: Array) -> Array:
         maps = self._resultants(X)
-        return read_back(maps.flow_tension(resample(u, maps.X.shape[-1])), X.shape[-1])
+        return resample(maps.flow_tension(resample(u, maps.X.shape[-1])), X.shape[-1])
 
     def near_layers(self, X: Array, f: Array) -> Array:
         xp = array_namespace(X)

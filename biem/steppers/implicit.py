@@ -22,7 +22,8 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from biem.backend import Array, array_namespace, constant, count, from_numpy, one_blas_thread, parallel_map, stage, to_numpy
-from biem.curves.fourier import read_back, read_back_matrix, resample, resampling_matrix
+from biem.curves.curve import speed
+from biem.curves.fourier import resample, resampling_matrix
 from biem.curves.lattice import Box
 from biem.errors import NumericalFailure
 from biem.membrane.contrast import vesicle_operators
@@ -96,7 +97,7 @@ class ImplicitStepper:
         if self.flow is not None:
             columns = columns + ops.outer(xp.reshape(resample(self.flow(state.X, state.t), ops.X.shape[-1]), (1, -1, 1)))
         increment, tension = relaxation_system(ops, columns, dt, self.tension)
-        sigma = None if tension is None else read_back(tension[..., 0], N)
+        sigma = None if tension is None else resample(tension[..., 0], N)
         X = state.X + resample(xp.reshape(increment, ops.X.shape), N)
         return StepResult(State(state.t + dt, X, sigma), {"gmres_iterations": 0})
 
@@ -129,15 +130,17 @@ class ImplicitStepper:
         increment, tension = relaxation_system(ops, columns, dt, True)
         D, D4 = ops.D, ops.D4
         x_s, y_s = ops.tangent[:, 0, :, None], ops.tangent[:, 1, :, None]
-        R = constant(read_back_matrix, N, n, like=X)
-        R_bend, R_tension = -self.kappa_b * xp.matmul(R, D4), xp.matmul(R, D)
+        R = constant(resampling_matrix, N, n, like=X)
+        speed_N = speed(X[which])
+        R_force = R * ops.speed[:, None, :] / speed_N[:, :, None]  # low-passed is the force on an arc: what is left sums to zero, too
+        R_bend, R_tension = -self.kappa_b * xp.matmul(R_force, D4), xp.matmul(R_force, D)
         fx = xp.matmul(R_bend, increment[:, :n]) + xp.matmul(R_tension, x_s * tension)
         fy = xp.matmul(R_bend, increment[:, n:]) + xp.matmul(R_tension, y_s * tension)
         force = xp.concat([fx, fy], axis=1)
-        low_pass = constant(resampling_matrix, N, n, like=X)  # see ExactMaps.relax
-        increment = xp.concat([xp.matmul(low_pass, increment[:, :n]), xp.matmul(low_pass, increment[:, n:])], axis=1)
+        increment = xp.concat([xp.matmul(R, increment[:, :n]), xp.matmul(R, increment[:, n:])], axis=1)
         tension = xp.matmul(R, tension)
-        force_0 = xp.reshape(force[..., 0], (m, 2, N)) + read_back(bending_force(ops.X, self.kappa_b), N)
+        bending = resample(bending_force(ops.X, self.kappa_b) * ops.speed[:, None, :], N) / speed_N[:, None, :]
+        force_0 = xp.reshape(force[..., 0], (m, 2, N)) + bending
         return Response(
             xp.reshape(increment[..., 0], (m, 2, N)),
             increment[..., 1:],

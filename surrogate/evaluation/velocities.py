@@ -1,7 +1,7 @@
 """Errors of advection and flow tension for velocities as they occur: background flows, and a neighbour at a gap of one arclength spacing.
 
-Reference: exact maps at the nodes of the resolved shape, read at the N nodes; the maps themselves get the low-passed shape and the velocity
-at the N nodes. Shapes are of length 1, turned by chance. In units of length and rate:
+Reference: exact maps at the nodes of the resolved shape, low-passed to N nodes; the maps themselves get the low-passed shape and the
+velocity at the N nodes. Shapes are of length 1, turned by chance. In units of length and rate:
 
     shear        u = (y, 0)                                     about the centroid
     poiseuille   u = (W - (y + y_0)^2/W, 0), W = R/0.4          y_0 by chance within W/2; the velocity of the centroid is taken out
@@ -39,7 +39,7 @@ def velocity_errors(X: np.ndarray, rungs: Sequence[Rung], points: int, seed: int
         exact = ExactMaps(points=X.shape[-1])
         found: dict[str, dict[str, dict[str, Stats]]] = {}
         for flow, u in velocities(X, 1.0 / points, rng).items():
-            wanted = {"advection": exact.advect(X, u)[..., ::every], "flow_tension": exact.flow_tension(X, u)[..., ::every]}
+            wanted = {"advection": resample(exact.advect(X, u), points), "flow_tension": resample(exact.flow_tension(X, u), points)}
             v = np.ascontiguousarray(u[..., ::every])
             found[flow] = {slot: {} for slot in SLOTS}
             for rung in rungs:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from biem.backend import counting
-from biem.curves.curve import arclength_weights, area, effective_radius, inclination, length
+from biem.curves.curve import arclength_weights, area, effective_radius, inclination, length, speed
 from biem.curves.fourier import resample
 from biem.curves.shapes import ellipse, equilibrium, place
 from biem.errors import NumericalFailure
@@ -209,3 +209,14 @@ def test_membrane_force_at_the_new_state_moves_the_neighbour():
     bent[0] = place(ellipse(48, 0.65), np.array([-0.7, 0.0]), 0.4)
     assert np.abs(run(bent, None, 1e-5, 1, corrected=False).X[1] - bent[1]).max() > 1e-6
     assert np.isfinite(membrane_force(bent, np.zeros((2, 48)))).all()
+
+
+def test_forces_at_few_nodes_sum_to_zero():
+    """Those that answer a velocity too: a net force would move all other vesicles, however far away."""
+    X = pair(32)
+    response = ImplicitStepper(1.0, 1.0)._response(X, 1e-5)
+    each = speed(X)
+    size = np.abs(response.force_0).max()
+    assert np.abs((response.force_0 * each[:, None]).sum(-1)).max() < 1e-9 * size
+    columns = response.force_1.reshape(2, 2, 32, 64)
+    assert np.abs((columns * each[:, None, :, None]).sum(2)).max() < 1e-9 * np.abs(columns).max()
