@@ -2,7 +2,8 @@
 
 python -m studies.runs SCENE.json OUT.h5 [MODULE:ENDING]       what a process does: SCENE.json holds the resolved scene and its folder
 
-Beside OUT.h5 lies OUT.json: wall, CPU and stage seconds a step, peak memory, what was counted, how it ended.
+Beside OUT.h5 lies OUT.json: wall, CPU and stage seconds a step, peak memory, what was counted, how it ended; and OUT.weights, which networks
+it began with: with others it begins anew.
 """
 
 from __future__ import annotations
@@ -156,6 +157,7 @@ def run(scene: Scene, path: Path, ending: Ending | None = None) -> Record:
     failure = ""
     try:
         if not begun:
+            write_atomically(path.with_suffix(".weights"), weights_digest(scene).encode())
             _warm_up(scene)
     except (NumericalFailure, ValueError, MemoryError):
         pass  # the run itself says it
@@ -201,11 +203,12 @@ def _peak_bytes() -> float:
 
 
 def _begun(scene: Scene, path: Path) -> bool:
-    """Whether files of this very scene are there to go on with."""
+    """Whether files of this very scene, and of these networks, are there to go on with."""
     if not checkpoint_path(path).exists():
         return False
     try:
-        return same_scene(str(read_trajectory(path).attributes["scene"]), scene)
+        weights = path.with_suffix(".weights").read_text()
+        return weights == weights_digest(scene) and same_scene(str(read_trajectory(path).attributes["scene"]), scene)
     except (ValueError, FileNotFoundError):
         return False
 

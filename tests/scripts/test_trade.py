@@ -99,6 +99,17 @@ def test_other_weights_are_another_run(tmp_path):
     assert weights_digest(scene_of()) == ""
 
 
+def test_a_run_does_not_go_on_with_other_networks(tmp_path):
+    scene, path = scene_of(), tmp_path / "a.h5"
+    run(scene, path, Twice)
+    first = read_trajectory(path).attributes["run"]
+    run(scene, path)
+    assert read_trajectory(path).attributes["run"] == first
+    path.with_suffix(".weights").write_text("of others")
+    run(scene, path)
+    assert read_trajectory(path).attributes["run"] != first
+
+
 def test_a_scene_from_before_a_key_is_the_same_scene():
     scene = scene_of()
     stored = scene.model_dump(mode="json")
