@@ -189,13 +189,14 @@ CHANGES = {
 def test_other_settings_are_refused_by_name_old_and_new(tmp_path, case):
     change, expected = CHANGES[case]
     fill(tmp_path)
-    before = {path.name: path.stat() for path in tmp_path.iterdir()}
+    state = lambda: {path.name: (path.stat().st_ino, path.stat().st_size, path.stat().st_mtime_ns) for path in tmp_path.iterdir()}
+    before = state()
     wanted = empty(settings={**SETTINGS, **change})
     with pytest.raises(ValueError, match=expected) as caught:
         Ledger(tmp_path, wanted)
     assert "with other settings" in str(caught.value)
     assert "another folder (-o), or start anew with `python -m datagen harvest --force`" in str(caught.value)
-    assert {path.name: path.stat() for path in tmp_path.iterdir()} == before
+    assert state() == before
     assert len(Ledger(tmp_path, wanted, force=True).todo) == len(ROWS)
     assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
 
