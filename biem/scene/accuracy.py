@@ -24,7 +24,7 @@ PRESETS = {
     "fast": Preset(
         {
             "vesicles": {"points": 32},
-            "time": {"order": 2, "adaptive": True, "tolerance": 3e-3},
+            "time": {"order": 2, "adaptive": True, "tolerance": 1e-3},
             "solver": {"kind": "split", "dtype": "float32", "near_tolerance": 1e-4, "far_tolerance": 1e-4},
         },
         (0.05, 0.0125),
