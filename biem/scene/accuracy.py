@@ -28,8 +28,7 @@ PRESETS = {
             "solver": {"kind": "split", "dtype": "float32", "near_tolerance": 1e-4, "far_tolerance": 1e-4},
         },
         (0.05, 0.0125),
-        "positions within 2 % (a pair in shear) to 5 % of R (one vesicle in a parabola) over 10 t_gamma, "
-        "some 40 to 75 times cheaper than reference",
+        "positions within 1.5 % of R over 10 t_gamma for one or two vesicles, 40 to 94 times cheaper than reference",
     ),
     "balanced": Preset(
         {
@@ -38,7 +37,7 @@ PRESETS = {
             "solver": {"kind": "split", "dtype": "float32", "near_tolerance": 1e-5, "far_tolerance": 1e-5},
         },
         (0.02, 0.005),
-        "positions within 1 % of R over 10 t_gamma for one or two vesicles, 20 to 44 times cheaper than reference; in dense suspensions, "
+        "positions within 0.8 % of R over 10 t_gamma for one or two vesicles, 26 to 51 times cheaper than reference; in dense suspensions, "
         "where differences grow tenfold in 3 t_gamma, within 1 % of R over 1 t_gamma, and numbers of vesicles beyond",
     ),
     "reference": Preset(
