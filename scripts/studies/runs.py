@@ -2,8 +2,8 @@
 
 python -m studies.runs SCENE.json OUT.h5 [MODULE:ENDING]       what a process does: SCENE.json holds the resolved scene and its folder
 
-Beside OUT.h5 lies OUT.json: wall, CPU and stage seconds a step, peak memory, what was counted, how it ended; and OUT.weights, which networks
-it began with: with others it begins anew.
+Beside OUT.h5 lies OUT.json: wall, CPU and stage seconds a step, peak memory, what was counted, how it ended; and OUT.weights: which
+networks it began with. With others it begins anew.
 """
 
 from __future__ import annotations
