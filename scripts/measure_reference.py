@@ -187,7 +187,7 @@ def relaxation() -> None:
 def shear_pair_table() -> None:
     """Separation / R at 20 t_gamma."""
     rows = []
-    for N in (32, 64, 128):
+    for N in (32, 48, 64, 128):
         found = []
         for step in (0.02, 0.01, 0.005):
             X, R = shear_pair(N)
